@@ -1,0 +1,55 @@
+"""What the world shows: gymnasium environments, one MuJoCo camera for all suites, masks to positions, goals."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+from torchrl_ocwm.envs.opengl import import_mujoco
+
+if find_spec("mujoco") is not None:
+    import_mujoco()  # TorchRL imports it too, and would fail without saying what is missing
+
+from torchrl_ocwm.envs.positions import MaskToPosition, hold_last_seen, mask_centroid, masks_to_positions
+from torchrl_ocwm.envs.registry import ENVIRONMENTS, make_env
+from torchrl_ocwm.envs.workspace import Workspace
+
+if TYPE_CHECKING:
+    from torchrl_ocwm.envs.camera import Camera, Frame
+    from torchrl_ocwm.envs.positioning import PositioningEnv
+    from torchrl_ocwm.envs.reacher import Reacher
+
+__all__ = [
+    "ENVIRONMENTS",
+    "Camera",
+    "Frame",
+    "MaskToPosition",
+    "PositioningEnv",
+    "Reacher",
+    "Workspace",
+    "hold_last_seen",
+    "make_env",
+    "mask_centroid",
+    "masks_to_positions",
+]
+
+# These need a simulator, so they are imported when they are asked for.
+_LAZY = {
+    "Camera": "camera",
+    "Frame": "camera",
+    "PositioningEnv": "positioning",
+    "Reacher": "reacher",
+}
+
+if find_spec("gymnasium") is not None:
+    import gymnasium
+
+    for _environment in ENVIRONMENTS.values():
+        gymnasium.register(id=_environment.id, entry_point=_environment.entry_point)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(import_module(f"torchrl_ocwm.envs.{_LAZY[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

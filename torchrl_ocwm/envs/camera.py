@@ -1,0 +1,179 @@
+"""One MuJoCo camera for every suite: RGB, segmentation and depth, and where its pixels lie in the world."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from torchrl_ocwm.envs.opengl import OPEN, close_at_exit, context_class, import_mujoco, renderer_error
+
+if TYPE_CHECKING:
+    import mujoco
+else:
+    mujoco = import_mujoco()
+
+
+class Frame(NamedTuple):
+    """What a camera saw.
+
+    Args:
+        pixels: ``[H, W, 3]`` uint8.
+        geoms: ``[H, W]`` int32, the id of the geom seen at each pixel, -1 where there is none.
+        depth: ``[H, W]`` float32, metres along the optical axis; ``None`` unless asked for.
+    """
+
+    pixels: np.ndarray
+    geoms: np.ndarray
+    depth: np.ndarray | None
+
+
+class Camera:
+    """Renders a MuJoCo model from one of its cameras, off screen.
+
+    A frame takes two passes of OpenGL, one for the colours and one for segmentation and depth together. Shadows,
+    reflections and multisampling are off by default: they cost most of the time of a software renderer.
+
+    Args:
+        model: The MuJoCo model. It may be stepped by any suite.
+        camera: Name of a camera of the model.
+        height: Image height, pixels.
+        width: Image width, pixels.
+        shadows: Draw shadows.
+        reflections: Draw reflections.
+        multisampling: Samples per pixel of the colour pass, 0 for none.
+
+    Raises:
+        ValueError: if the model has no such camera.
+        RuntimeError: if no OpenGL library works, with what to install.
+
+    Examples:
+        >>> import mujoco
+        >>> model = mujoco.MjModel.from_xml_string('''<mujoco><worldbody><camera name="top" pos="0 0 1"/>
+        ...     <geom name="ball" type="sphere" size=".1"/></worldbody></mujoco>''')
+        >>> data = mujoco.MjData(model)
+        >>> mujoco.mj_forward(model, data)
+        >>> camera = Camera(model, "top", height=32, width=32)
+        >>> frame = camera.render(data, depth=True)
+        >>> frame.pixels.shape, int(frame.geoms[16, 16]), bool(abs(frame.depth[16, 16] - 0.9) < 0.01)
+        ((32, 32, 3), 0, True)
+        >>> camera.close()
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        camera: str,
+        *,
+        height: int = 64,
+        width: int = 64,
+        shadows: bool = False,
+        reflections: bool = False,
+        multisampling: int = 0,
+        max_geoms: int = 2000,
+    ) -> None:
+        self.camera_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+        if self.camera_id < 0:
+            names = [model.camera(index).name for index in range(model.ncam)]
+            raise ValueError(f"the model has no camera {camera!r}; it has {names}")
+        self.model, self.height, self.width = model, height, width
+        self._context = self._gl = None
+        self._set_up(multisampling)
+        self._scene = mujoco.MjvScene(model, maxgeom=max_geoms)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
+        self._known_scene: tuple[int, bytes] | None = None
+        self._options = mujoco.MjvOption()
+        self._view = mujoco.MjvCamera()
+        self._view.type, self._view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, self.camera_id
+        self._rectangle = mujoco.MjrRect(0, 0, width, height)
+        self._pixels = np.empty((height, width, 3), np.uint8)
+        self._ids = np.empty((height, width, 3), np.uint8)
+        self._depth = np.empty((height, width), np.float32)
+
+    def _set_up(self, multisampling: int) -> None:
+        """Make the OpenGL context; its buffers take their size and samples from the model, which stays unchanged."""
+        vis = self.model.vis
+        before = vis.quality.offsamples, vis.global_.offwidth, vis.global_.offheight
+        vis.quality.offsamples, vis.global_.offwidth, vis.global_.offheight = multisampling, self.width, self.height
+        try:
+            self._gl = context_class()(self.width, self.height)
+            self._gl.make_current()
+            self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except Exception as error:  # each OpenGL binding raises an error class of its own
+            raise renderer_error(error) from error
+        finally:
+            vis.quality.offsamples, vis.global_.offwidth, vis.global_.offheight = before
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        close_at_exit(self)
+
+    def render(self, data: mujoco.MjData, *, depth: bool = False) -> Frame:
+        """Render the state in ``data``, which must be up to date (``mj_forward``).
+
+        Args:
+            data: A state of the camera's model.
+            depth: Read the depth too; it comes out of the segmentation pass.
+        """
+        if self._context is None:
+            raise RuntimeError("this camera is closed")
+        self._gl.make_current()
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self.model, data, self._options, None, self._view, everything, self._scene)
+        mujoco.mjr_render(self._rectangle, self._scene, self._context)
+        mujoco.mjr_readPixels(self._pixels, None, self._rectangle, self._context)
+
+        flags = self._scene.flags
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
+        mujoco.mjr_render(self._rectangle, self._scene, self._context)
+        mujoco.mjr_readPixels(self._ids, self._depth if depth else None, self._rectangle, self._context)
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
+        # OpenGL's rows run upwards.
+        return Frame(self._pixels[::-1].copy(), self._geoms(), self._metres() if depth else None)
+
+    def _geoms(self) -> np.ndarray:
+        # Which geoms are in the scene depends on what is transparent; reading the list is slow.
+        scene = self._scene.ngeom, self.model.geom_rgba[:, 3].tobytes()
+        if scene != self._known_scene:
+            self._known_scene = scene
+            self._geom_of_segment = np.full(self._scene.ngeom + 1, -1, np.int32)
+            for geom in self._scene.geoms[: self._scene.ngeom]:
+                if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                    self._geom_of_segment[geom.segid + 1] = geom.objid
+        ids = self._ids[::-1]
+        return self._geom_of_segment[ids[..., 0] + (ids[..., 1].astype(np.int32) << 8)]  # fewer than 65,536 geoms
+
+    def _metres(self) -> np.ndarray:
+        extent, clip = self.model.stat.extent, self.model.vis.map
+        near, far = clip.znear * extent, clip.zfar * extent
+        # The buffer holds 1 at the near plane and 0 at the far one, linear in 1/z.
+        inverse = self._depth[::-1].astype(np.float64) * (1 / near - 1 / far) + 1 / far
+        return (1 / inverse).astype(np.float32)
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """``[3, 3]`` float32 pinhole matrix in pixels; the centre of the first pixel is (0.5, 0.5)."""
+        focal = self.height / 2 / np.tan(np.deg2rad(self.model.cam_fovy[self.camera_id]) / 2)
+        return np.array([[focal, 0, self.width / 2], [0, focal, self.height / 2], [0, 0, 1]], np.float32)
+
+    def extrinsics(self, data: mujoco.MjData) -> np.ndarray:
+        """``[4, 4]`` float32 camera-to-world matrix; x points right in the image, y down, z into the scene."""
+        pose = np.eye(4, dtype=np.float32)
+        # MuJoCo's cameras look along -z with y up.
+        pose[:3, :3] = data.cam_xmat[self.camera_id].reshape(3, 3) * np.array([1, -1, -1])
+        pose[:3, 3] = data.cam_xpos[self.camera_id]
+        return pose
+
+    def close(self) -> None:
+        """Free the OpenGL context. Closing twice does nothing."""
+        if self._context is not None:
+            self._context.free()
+        if self._gl is not None:
+            self._gl.free()
+        self._context = self._gl = None
+        OPEN.discard(self)
+
+    def __del__(self) -> None:
+        if not sys.is_finalizing() and "_gl" in self.__dict__:
+            self.close()

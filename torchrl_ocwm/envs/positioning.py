@@ -1,0 +1,275 @@
+"""The part that all positioning environments share: frames, masks, positions, goals and rewards."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from torchrl_ocwm.envs.camera import Camera
+from torchrl_ocwm.envs.positions import masks_to_positions
+from torchrl_ocwm.envs.workspace import Workspace
+
+SUCCESS_DISTANCE = 0.05  # metres; paper, figure "reconstructions"
+TARGET_COLOUR = (230, 40, 40)
+
+Observation = dict[str, np.ndarray]
+
+
+class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
+    """Bring an entity to a goal position, seen by one fixed camera.
+
+    Observations follow the data contract (docs/data.md): ``pixels`` (3, H, W) uint8, ``masks`` (O, H, W) bool,
+    ``proprio`` (P,) float32, ``object_position`` (O, D) float32 metres from the start position, estimated from the
+    masks, ``object_visible`` (O,) bool, ``goal_position`` (D,) float32 metres, and ``object_position_true`` (O, D),
+    the simulator's own value, kept for tests and evaluation only. A hidden object keeps the position where it was last
+    seen.
+
+    The reward is −‖p − p_g‖₂ in metres (paper, equation 1) of the first object; ``info["success"]`` says whether it is
+    within 5 cm. Episodes are truncated after ``horizon`` steps and never terminate.
+
+    A suite adds an environment by filling in the class attributes and the six abstract methods.
+
+    Args:
+        image_size: Height and width of the images, pixels.
+        horizon: Steps per episode.
+        action_repeat: Simulator control steps per step.
+        virtual_target: Diameter in pixels of a disc drawn at the goal, 0 for none (paper, "Size matters!").
+        camera_options: Passed to :class:`~torchrl_ocwm.envs.Camera`: shadows, reflections, multisampling.
+        render_mode: ``"rgb_array"`` makes :meth:`render` return the camera image (H, W, 3).
+
+    Raises:
+        ValueError: for a horizon, action repeat or image size below one, a goal outside the workspace, or an action
+            that is not finite or has another shape.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
+
+    workspace: ClassVar[Workspace]
+    #: World position that all positions are relative to, metres.
+    start: ClassVar[tuple[float, float, float]]
+    #: World axes that positions have.
+    axes: ClassVar[tuple[int, ...]]
+    camera_name: ClassVar[str]
+    #: Geoms of each object, by name; the first object is the one to position.
+    objects: ClassVar[dict[str, tuple[str, ...]]]
+    #: Plane (n, d) that the objects move on; ``None``: read the depth.
+    plane: ClassVar[tuple[float, float, float, float] | None] = None
+
+    def __init__(
+        self,
+        *,
+        image_size: int = 64,
+        horizon: int = 500,
+        action_repeat: int = 2,
+        virtual_target: int = 0,
+        camera_options: dict[str, Any] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        for name, value in (("image_size", image_size), ("horizon", horizon), ("action_repeat", action_repeat)):
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        if virtual_target < 0:
+            raise ValueError(f"virtual_target is a diameter in pixels, 0 for none; got {virtual_target}")
+        self.image_size, self.horizon, self.action_repeat = image_size, horizon, action_repeat
+        self.virtual_target, self.render_mode = virtual_target, render_mode
+        self.model, self.data = self._load()
+        self.camera = Camera(
+            self.model, self.camera_name, height=image_size, width=image_size, **(camera_options or {})
+        )
+        self._start, self._axes = np.array(self.start), list(self.axes)
+        self._geom_ids = [[self.model.geom(name).id for name in names] for names in self.objects.values()]
+        self._scratch: mujoco.MjData | None = None
+        self._goal = np.zeros(self.workspace.dim, np.float32)
+        self._last_seen = np.zeros((len(self.objects), self.workspace.dim), np.float32)
+        self._steps = 0
+        mujoco.mj_forward(self.model, self.data)
+        self._plane = None if self.plane is None else torch.tensor(self.plane)
+        self._intrinsics = torch.from_numpy(self.camera.intrinsics)
+        self._extrinsics = torch.from_numpy(self.camera.extrinsics(self.data))
+        self.observation_space = self._observation_space()
+        self.action_space = spaces.Box(-1.0, 1.0, self._action_shape(), np.float32)
+
+    # What a suite fills in.
+
+    @abstractmethod
+    def _load(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Load the simulator; return its MuJoCo model and data."""
+
+    @abstractmethod
+    def _reset_simulator(self) -> None:
+        """Draw a start state from ``self.np_random`` and bring ``self.data`` up to date."""
+
+    @abstractmethod
+    def _step_simulator(self, action: np.ndarray) -> None:
+        """Advance one control step and bring ``self.data`` up to date."""
+
+    @abstractmethod
+    def _proprio(self, data: mujoco.MjData) -> np.ndarray:
+        """Joint positions and velocities, (P,)."""
+
+    @abstractmethod
+    def _true_position(self, data: mujoco.MjData) -> np.ndarray:
+        """World positions of the objects, (O, 3), metres."""
+
+    @abstractmethod
+    def _teleport(self, data: mujoco.MjData, position: np.ndarray) -> None:
+        """Put the first object of ``data`` at a position (D,), metres from the start, or as near as can be."""
+
+    def _action_shape(self) -> tuple[int, ...]:
+        return (self.model.nu,)
+
+    # Gymnasium's interface.
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
+        """Start an episode.
+
+        Args:
+            seed: Seeds the environment's random numbers.
+            options: ``{"goal_position": (D,)}`` gives the goal in metres; otherwise it is uniform in the workspace.
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        unknown = set(options) - {"goal_position"}
+        if unknown:
+            raise ValueError(f"unknown reset options {sorted(unknown)}; the only one is 'goal_position'")
+        low, high = np.array(self.workspace.low), np.array(self.workspace.high)
+        goal = self.np_random.uniform(low, high)  # drawn also when given, so that a goal does not move the start
+        if options.get("goal_position") is not None:
+            goal = self.workspace.check(options["goal_position"]).numpy()
+        if goal.shape != low.shape:
+            raise ValueError(f"one goal position of shape {low.shape} per episode, got shape {goal.shape}")
+        self._goal = goal.astype(np.float32)
+        self._reset_simulator()
+        self._steps = 0
+        self._last_seen = np.zeros_like(self._last_seen)
+        observation = self._observe(self.data)
+        self._last_seen = observation["object_position"]
+        return observation, self._info(observation)
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict]:
+        """Apply an action in [−1, 1] for ``action_repeat`` control steps; values beyond are clipped."""
+        action = np.asarray(action, np.float64)
+        if action.shape != self.action_space.shape:
+            raise ValueError(f"an action has shape {self.action_space.shape}, got {action.shape}")
+        if not np.isfinite(action).all():
+            raise ValueError(f"an action must be finite, got {action.tolist()}")
+        for _ in range(self.action_repeat):
+            self._step_simulator(action.clip(-1, 1))
+        self._steps += 1
+        observation = self._observe(self.data)
+        self._last_seen = observation["object_position"]
+        reward = -self._distance(observation)  # Eq. 1
+        return observation, reward, False, self._steps >= self.horizon, self._info(observation)
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The camera image (H, W, 3) uint8, with ``render_mode="rgb_array"``."""
+        if self.render_mode != "rgb_array":
+            return None
+        return np.ascontiguousarray(self._observe(self.data)["pixels"].transpose(1, 2, 0))
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        if "camera" in self.__dict__:
+            self.camera.close()
+
+    # Goals and observations.
+
+    def goal_observation(self, goal_position: np.ndarray) -> Observation:
+        """What would be seen with the first object at a goal; the running episode is not touched.
+
+        Args:
+            goal_position: (D,) metres. Where the robot cannot reach it, the nearest reachable position is shown.
+
+        Returns:
+            An observation with the keys of the environment, ``goal_position`` set to the goal.
+        """
+        goal = self.workspace.check(goal_position).numpy()
+        if self._scratch is None:
+            self._scratch = mujoco.MjData(self.model)
+        mujoco.mj_copyData(self._scratch, self.model, self.data)
+        self._teleport(self._scratch, goal)
+        mujoco.mj_forward(self.model, self._scratch)
+        observation = self._observe(self._scratch, goal=goal)
+        return observation
+
+    def _observation_space(self) -> spaces.Dict:
+        size, objects, dim = self.image_size, len(self.objects), self.workspace.dim
+
+        def real(*shape: int) -> spaces.Box:
+            return spaces.Box(-np.inf, np.inf, shape, np.float32)
+
+        return spaces.Dict(
+            {
+                "pixels": spaces.Box(0, 255, (3, size, size), np.uint8),
+                "masks": spaces.Box(0, 1, (objects, size, size), np.bool_),
+                "proprio": real(*self._proprio(self.data).shape),
+                "object_position": real(objects, dim),
+                "object_visible": spaces.Box(0, 1, (objects,), np.bool_),
+                "goal_position": spaces.Box(np.float32(self.workspace.low), np.float32(self.workspace.high)),
+                "object_position_true": real(objects, dim),
+            }
+        )
+
+    def _observe(self, data: mujoco.MjData, goal: np.ndarray | None = None) -> Observation:
+        goal = self._goal if goal is None else goal
+        frame = self.camera.render(data, depth=self._plane is None)
+        masks = np.stack([_any_of(frame.geoms, ids) for ids in self._geom_ids])
+        world, visible = masks_to_positions(
+            torch.from_numpy(masks),
+            self._intrinsics,
+            self._extrinsics,
+            depth=None if frame.depth is None else torch.from_numpy(frame.depth[None]),
+            plane=self._plane,
+        )
+        seen = visible.numpy()
+        estimate = self._relative(world.numpy())
+        return {
+            "pixels": self._paint_target(frame.pixels, masks[0], goal).transpose(2, 0, 1),
+            "masks": masks,
+            "proprio": self._proprio(data).astype(np.float32),
+            "object_position": np.where(seen[:, None], estimate, self._last_seen),
+            "object_visible": seen,
+            "goal_position": goal.copy(),
+            "object_position_true": self._relative(self._true_position(data)),
+        }
+
+    def _relative(self, world: np.ndarray) -> np.ndarray:
+        return (world - self._start)[:, self._axes].astype(np.float32)
+
+    def _distance(self, observation: Observation) -> float:
+        return float(np.linalg.norm(observation["object_position"][0] - observation["goal_position"]))
+
+    def _info(self, observation: Observation) -> dict[str, Any]:
+        return {"success": self._distance(observation) <= SUCCESS_DISTANCE}
+
+    def _paint_target(self, pixels: np.ndarray, entity: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        if not self.virtual_target:
+            return pixels
+        column, row = self.project(goal)
+        centres = np.arange(self.image_size) + 0.5
+        distance = np.hypot(centres[None] - column, centres[:, None] - row)
+        disc = (distance <= self.virtual_target / 2) | (distance == distance.min())
+        pixels[disc & ~entity] = TARGET_COLOUR
+        return pixels
+
+    def project(self, position: np.ndarray) -> np.ndarray:
+        """Where a position (..., D), metres from the start, appears in the image: (..., 2) as (column, row)."""
+        world = np.broadcast_to(self._start, (*position.shape[:-1], 3)).copy()
+        world[..., self._axes] += position
+        pose = self._extrinsics.numpy()
+        in_camera = (world - pose[:3, 3]) @ pose[:3, :3]
+        in_image = in_camera @ self._intrinsics.numpy().T
+        return in_image[..., :2] / in_image[..., 2:]
+
+
+def _any_of(geoms: np.ndarray, ids: list[int]) -> np.ndarray:
+    mask = geoms == ids[0]
+    for geom in ids[1:]:
+        mask |= geoms == geom
+    return mask

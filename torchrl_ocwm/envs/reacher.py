@@ -1,0 +1,94 @@
+"""Reacher: a two-link planar arm, the physics of dm_control's ``reacher`` task."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from torchrl_ocwm.envs.positioning import PositioningEnv
+from torchrl_ocwm.envs.workspace import Workspace
+
+try:
+    from dm_control.suite import reacher as dm_reacher
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        f"Reacher needs dm_control, and {error.name!r} is not installed: pip install 'torchrl-ocwm[dm-control]'",
+        name=error.name,
+    ) from None
+
+_LINK = 0.12  # metres, both links
+_WRIST_LIMIT = np.deg2rad(160)
+
+
+class Reacher(PositioningEnv):
+    """Bring the finger tip of a planar arm to a goal.
+
+    Two torques in [−1, 1]. ``proprio`` holds cos and sin of the shoulder (it turns freely), the wrist angle (radians)
+    and both joint velocities (radians per second). One object, the finger tip. Joint angles are uniform at each reset.
+    The wrist stops at ±160°, so the finger tip reaches the ring between 4.2 and 24 cm from the shoulder; the corners
+    of the square workspace lie beyond.
+
+    Takes the arguments of :class:`~torchrl_ocwm.envs.PositioningEnv`.
+
+    Examples:
+        >>> import gymnasium, torchrl_ocwm.envs
+        >>> env = gymnasium.make("ocwm/Reacher-v0", horizon=100)
+        >>> observation, info = env.reset(seed=0, options={"goal_position": (0.1, 0.1)})
+        >>> observation["pixels"].shape, observation["object_position"].shape
+        ((3, 64, 64), (1, 2))
+        >>> env.close()
+    """
+
+    workspace = Workspace(
+        low=(-0.24, -0.24),
+        high=(0.24, 0.24),
+        reach=(2 * _LINK * float(np.cos(_WRIST_LIMIT / 2)), 2 * _LINK),
+        landmarks=(
+            (0.24, 0.0),
+            (-0.24, 0.0),
+            (0.0, -0.24),
+            (0.0, 0.24),
+            (-0.11, 0.07),
+            (0.11, -0.07),
+            (0.11, 0.18),
+            (-0.11, -0.18),
+            (0.066, 0.036),
+            (-0.062, -0.043),
+        ),
+    )
+    start = (0.0, 0.0, 0.01)
+    axes = (0, 1)
+    camera_name = "fixed"
+    objects = {"finger": ("finger",)}  # noqa: RUF012
+    plane = (0.0, 0.0, 1.0, 0.01)
+
+    def _load(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        xml, assets = dm_reacher.get_model_and_assets()
+        model = mujoco.MjModel.from_xml_string(xml, assets)
+        model.geom("target").rgba[3] = 0  # the task's own target; MuJoCo draws no geom with alpha 0
+        return model, mujoco.MjData(model)
+
+    def _reset_simulator(self) -> None:
+        mujoco.mj_resetData(self.model, self.data)
+        low, high = np.array([-np.pi, -_WRIST_LIMIT]), np.array([np.pi, _WRIST_LIMIT])
+        self.data.qpos[:] = self.np_random.uniform(low, high)
+        mujoco.mj_forward(self.model, self.data)
+
+    def _step_simulator(self, action: np.ndarray) -> None:
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data)
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def _proprio(self, data: mujoco.MjData) -> np.ndarray:
+        shoulder, wrist = data.qpos
+        return np.array([np.cos(shoulder), np.sin(shoulder), wrist, *data.qvel])
+
+    def _true_position(self, data: mujoco.MjData) -> np.ndarray:
+        return data.geom_xpos[self._geom_ids[0]]
+
+    def _teleport(self, data: mujoco.MjData, position: np.ndarray) -> None:
+        # Two equal links: the elbow angle follows from the distance, the shoulder from the direction.
+        distance = float(np.clip(np.linalg.norm(position), *self.workspace.reach))
+        wrist = 2 * np.arccos(np.clip(distance / (2 * _LINK), 0, 1))
+        data.qpos[:] = np.arctan2(position[1], position[0]) - wrist / 2, wrist
+        data.qvel[:] = 0

@@ -1,0 +1,88 @@
+"""The environments by name, and how to make them ready for TorchRL."""
+
+from __future__ import annotations
+
+from functools import partial
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+import torch
+from torchrl.envs import EnvBase, InitTracker, ParallelEnv, TransformedEnv
+
+
+class Environment(NamedTuple):
+    """One row: gymnasium id, where its class is, and the extra that installs its simulator."""
+
+    id: str
+    entry_point: str
+    extra: str
+    module: str
+
+
+#: Short name → environment.
+ENVIRONMENTS = {
+    "reacher": Environment("ocwm/Reacher-v0", "torchrl_ocwm.envs.reacher:Reacher", "dm-control", "dm_control"),
+}
+
+
+def make_env(
+    name: str,
+    *,
+    num_envs: int = 1,
+    seed: int | None = None,
+    device: torch.device | str | None = None,
+    **options: Any,
+) -> EnvBase:
+    """Make an environment for TorchRL's collectors and rollouts.
+
+    Args:
+        name: A short name or gymnasium id of :data:`ENVIRONMENTS`.
+        num_envs: With more than one, that many processes step in parallel (:class:`~torchrl.envs.ParallelEnv`).
+        seed: Seeds the environments, each differently.
+        device: Where observations are put.
+        options: Passed to the environment: image_size, horizon, action_repeat, virtual_target, camera_options.
+
+    Returns:
+        An environment with the keys of the data contract (docs/data.md) and ``is_init``. The goal of an episode can be
+        given at reset: ``env.reset(options={"goal_position": ...})``.
+
+    Raises:
+        ValueError: for an unknown name.
+        ModuleNotFoundError: if the simulator is missing, with the extra to install.
+
+    Examples:
+        >>> env = make_env("reacher", horizon=50, seed=0)
+        >>> env.rollout(3)["next", "object_position"].shape
+        torch.Size([3, 1, 2])
+        >>> env.close()
+    """
+    environment = _find(name)
+    if num_envs < 1:
+        raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+    make = partial(_make_one, environment, device=device, **options)
+    env = make() if num_envs == 1 else ParallelEnv(num_envs, make, mp_start_method="spawn", device=device)
+    if seed is not None:
+        env.set_seed(seed)
+    return env
+
+
+def _find(name: str) -> Environment:
+    by_id = {environment.id: environment for environment in ENVIRONMENTS.values()}
+    environment = ENVIRONMENTS.get(name) or by_id.get(name)
+    if environment is None:
+        raise ValueError(f"unknown environment {name!r}; there are {', '.join(ENVIRONMENTS)}")
+    for module, extra in (("gymnasium", environment.extra), (environment.module, environment.extra)):
+        if find_spec(module) is None:
+            raise ModuleNotFoundError(
+                f"environment {name!r} needs {module}, which is not installed: pip install 'torchrl-ocwm[{extra}]'",
+                name=module,
+            )
+    return environment
+
+
+def _make_one(environment: Environment, *, device: torch.device | str | None, **options: Any) -> EnvBase:
+    from torchrl.envs import GymEnv
+
+    import torchrl_ocwm.envs  # noqa: F401  (registers the ids in a fresh process)
+
+    return TransformedEnv(GymEnv(environment.id, device=device, **options), InitTracker())
