@@ -1,0 +1,8 @@
+"""Which agents there are: rows of choices, and the builder that wires them."""
+
+from torchrl_ocwm.agents.agent import Agent
+from torchrl_ocwm.agents.build import build_agent
+from torchrl_ocwm.agents.config import AgentConfig, Size
+from torchrl_ocwm.agents.presets import AGENTS, SIZES
+
+__all__ = ["AGENTS", "SIZES", "Agent", "AgentConfig", "Size", "build_agent"]

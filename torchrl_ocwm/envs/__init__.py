@@ -12,7 +12,8 @@ if find_spec("mujoco") is not None:
     import_mujoco()  # TorchRL imports it too, and would fail without saying what is missing
 
 from torchrl_ocwm.envs.positions import MaskToPosition, hold_last_seen, mask_centroid, masks_to_positions
-from torchrl_ocwm.envs.registry import ENVIRONMENTS, make_env
+from torchrl_ocwm.envs.registry import ENVIRONMENTS, make_env, make_task
+from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.envs.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -27,9 +28,11 @@ __all__ = [
     "MaskToPosition",
     "PositioningEnv",
     "Reacher",
+    "Task",
     "Workspace",
     "hold_last_seen",
     "make_env",
+    "make_task",
     "mask_centroid",
     "masks_to_positions",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import multiprocessing
 import os
 import sys
 import weakref
@@ -36,6 +37,9 @@ def import_mujoco() -> Any:
 def context_class() -> Any:
     """MuJoCo's OpenGL context class. MuJoCo's own default needs a screen; without one this takes EGL."""
     mujoco = import_mujoco()
+    if multiprocessing.parent_process() is not None:
+        # Workers of a pool share the cores: Mesa's software renderer must not start threads in each of them.
+        os.environ.setdefault("LP_NUM_THREADS", "0")
     library = os.environ.get("MUJOCO_GL", "").lower().strip()
     if not library and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         library = "egl"

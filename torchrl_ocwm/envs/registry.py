@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import torch
 from torchrl.envs import EnvBase, InitTracker, ParallelEnv, TransformedEnv
+
+from torchrl_ocwm.envs.task import Task
 
 
 class Environment(NamedTuple):
@@ -64,6 +67,29 @@ def make_env(
     if seed is not None:
         env.set_seed(seed)
     return env
+
+
+def make_task(name: str, **options: Any) -> Task:
+    """What an agent must know of an environment made with ``make_env(name, **options)``.
+
+    Examples:
+        >>> make_task("reacher").objects
+        ('finger',)
+    """
+    import gymnasium
+
+    import torchrl_ocwm.envs  # noqa: F401  (registers the ids)
+
+    with closing(gymnasium.make(_find(name).id, **options)) as env:
+        space = env.observation_space
+        return Task(
+            name=name,
+            image_size=space["pixels"].shape[-1],
+            objects=tuple(env.unwrapped.objects),
+            proprio=space["proprio"].shape[0],
+            action=env.action_space.shape[0],
+            workspace=env.unwrapped.workspace,
+        )
 
 
 def _find(name: str) -> Environment:

@@ -1,0 +1,25 @@
+"""What predicts: encoders, world models, goals, imagined rewards, the imagination environment, acting."""
+
+from torchrl_ocwm.modules.acting import ActingLatent
+from torchrl_ocwm.modules.actor import Actor
+from torchrl_ocwm.modules.goals import UniformGoals
+from torchrl_ocwm.modules.imagination import ImaginationEnv
+from torchrl_ocwm.modules.latent import InitialLatent
+from torchrl_ocwm.modules.observation import ObservationEncoder
+from torchrl_ocwm.modules.rewards import PositionDistance, PositionDistanceReward, position_distance
+from torchrl_ocwm.modules.units import WorkspaceUnits
+from torchrl_ocwm.modules.world_model import FlatWorldModel
+
+__all__ = [
+    "ActingLatent",
+    "Actor",
+    "FlatWorldModel",
+    "ImaginationEnv",
+    "InitialLatent",
+    "ObservationEncoder",
+    "PositionDistance",
+    "PositionDistanceReward",
+    "UniformGoals",
+    "WorkspaceUnits",
+    "position_distance",
+]

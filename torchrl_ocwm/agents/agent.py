@@ -1,0 +1,210 @@
+"""An agent: a world model, an actor and a critic, wired as a row of choices says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.modules import DreamerV3MLP, IndependentNormal, SymExpTwoHot
+from torchrl.objectives import DreamerV3ActorLoss, DreamerV3ValueLoss, ValueEstimators
+
+from torchrl_ocwm.agents.config import AgentConfig, Size
+from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.modules import (
+    ActingLatent,
+    Actor,
+    FlatWorldModel,
+    ImaginationEnv,
+    PositionDistanceReward,
+    UniformGoals,
+    WorkspaceUnits,
+)
+from torchrl_ocwm.objectives import GoalConditionedDreamerLoss, WorldModelLoss
+
+GAMMA, LAMBDA = 0.99, 0.95
+GOAL: NestedKey = ("latent", "goal")
+
+
+def flat_world_model(task: Task, config: AgentConfig, size: Size) -> FlatWorldModel:
+    """A world model with one latent for the whole scene."""
+    return FlatWorldModel(
+        image_size=task.image_size,
+        proprio=task.proprio,
+        objects=len(task.objects),
+        action=task.action,
+        units=WorkspaceUnits(task.workspace.low, task.workspace.high),
+        observed=config.observed,
+        reward_head=config.reward == "head",
+        **size.architecture(),
+    )
+
+
+def position_goal(model: FlatWorldModel) -> tuple[int, TensorDictModuleBase]:
+    """The goal position itself (paper, section PCP)."""
+    return model.units.dim, TensorDictModule(nn.Identity(), ["goal_units"], [GOAL])
+
+
+def no_goal(model: FlatWorldModel) -> tuple[int, None]:  # noqa: ARG001
+    """Nothing: the world model has to remember the goal that it observed."""
+    return 0, None
+
+
+def learned_reward(model: FlatWorldModel) -> TensorDictModuleBase:
+    """What the reward head predicts."""
+    return model.reward()
+
+
+def position_distance_reward(model: FlatWorldModel) -> TensorDictModuleBase:
+    """The distance between decoded position and goal position (paper, equation 3)."""
+    return TensorDictSequential(model.object_position(), PositionDistanceReward(model.units))
+
+
+#: The choices by name. A new world model, goal, reward or goal source is one function and one entry here.
+WORLD_MODELS: dict[str, Callable[[Task, AgentConfig, Size], FlatWorldModel]] = {"flat": flat_world_model}
+GOALS: dict[str, Callable[[FlatWorldModel], tuple[int, TensorDictModuleBase | None]]] = {
+    "none": no_goal,
+    "position": position_goal,
+}
+REWARDS: dict[str, Callable[[FlatWorldModel], TensorDictModuleBase]] = {
+    "head": learned_reward,
+    "position_distance": position_distance_reward,
+}
+GOAL_SOURCES: dict[str, Callable[[FlatWorldModel], TensorDictModuleBase | None]] = {
+    "environment": lambda model: None,  # noqa: ARG005
+    "uniform": lambda model: UniformGoals(model.units.dim),
+}
+
+
+class Agent(nn.Module):
+    """A world model, an actor and a critic for one task.
+
+    Args:
+        task: What the agent is for.
+        config: The row of choices.
+        size: How large it is.
+
+    Attributes:
+        model: The world model.
+        imagination: The world model as an environment, with the goal in its state.
+        loss: World model, actor and critic in one loss, as TorchRL's DreamerV3 stepper takes it.
+
+    Raises:
+        ValueError: if the choices do not fit together or an image of the task cannot be halved by the CNN.
+    """
+
+    def __init__(self, task: Task, config: AgentConfig, size: Size) -> None:
+        super().__init__()
+        self.task, self.config, self.size = task, config, size
+        self.model = WORLD_MODELS[config.world_model](task, config, size)
+        goal_features, goal_encoder = GOALS[config.goal](self.model)
+        goal_source = GOAL_SOURCES[config.goal_source](self.model)
+        if (goal_source is None) != (goal_encoder is None):
+            raise ValueError(
+                f"goal={config.goal!r} does not go with goal_source={config.goal_source!r}: a policy that sees a goal "
+                "needs goals in imagination, and only that one"
+            )
+        self.goal_encoder = goal_encoder
+        self.actor = self._make_actor(goal_features)
+        self.imagination = ImaginationEnv(
+            self.model.transition(),
+            REWARDS[config.reward](self.model),
+            state=self.model.state,
+            belief=self.model.belief,
+            action=task.action,
+            goal=goal_features,
+        )
+        source = None if goal_source is None else TensorDictSequential(goal_source, goal_encoder)
+        self.loss = self._make_loss(self._make_critic(goal_features), source)
+
+    def policy(self) -> TensorDictSequential:
+        """The policy that acts, as a module that runs in any rollout of an environment of the task.
+
+        Reads the observations, ``goal_position`` ``[..., D]`` in metres and ``is_init``; writes ``action``. It carries
+        its latent in the tensordict. Actions are drawn from the actor, or its mean under
+        ``set_exploration_type(ExplorationType.DETERMINISTIC)``.
+        """
+        model = self.model
+        goal: list[TensorDictModuleBase] = []
+        if self.goal_encoder is not None:
+            goal = [TensorDictModule(model.units, ["goal_position"], ["goal_units"]), self.goal_encoder]
+        return TensorDictSequential(
+            ActingLatent(model.state, model.belief, self.task.action),
+            model.filter(),
+            *goal,
+            self.actor,
+            # What is done is what the next step remembers.
+            TensorDictModule(_clamp, ["action"], ["action"]),
+            TensorDictModule(torch.clone, ["action"], [("latent", "action")]),
+        )
+
+    def _make_actor(self, goal_features: int) -> ProbabilisticTensorDictSequential:
+        size = self.size
+        network = Actor(
+            self.model.latent_features + goal_features, self.task.action, layers=size.mlp_layers, units=size.mlp_units
+        )
+        return ProbabilisticTensorDictSequential(
+            TensorDictModule(network, _inputs(goal_features), ["loc", "scale"]),
+            ProbabilisticTensorDictModule(
+                ["loc", "scale"],
+                ["action"],
+                distribution_class=IndependentNormal,
+                distribution_kwargs={"tanh_loc": False, "validate_args": False},
+                return_log_prob=False,
+            ),
+        )
+
+    def _make_critic(self, goal_features: int) -> TensorDictSequential:
+        two_hot, size = SymExpTwoHot(), self.size
+        network = DreamerV3MLP(
+            self.model.latent_features + goal_features,
+            two_hot.num_bins,
+            depth=size.mlp_layers,
+            num_cells=size.mlp_units,
+            outscale=0.0,
+        )
+        return TensorDictSequential(
+            TensorDictModule(network, _inputs(goal_features), ["state_value_logits"]),
+            TensorDictModule(two_hot, ["state_value_logits"], ["state_value"]),
+        )
+
+    def _make_loss(
+        self, critic: TensorDictSequential, goal_source: TensorDictModuleBase | None
+    ) -> GoalConditionedDreamerLoss:
+        config, size = self.config, self.size
+        model_loss = WorldModelLoss(
+            self.model.records(),
+            lambda_proprio=config.lambda_proprio,
+            lambda_object_position=config.lambda_object_position,
+            lambda_goal_position=config.lambda_goal_position,
+        )
+        actor_loss = DreamerV3ActorLoss(
+            self.actor,
+            critic,
+            self.imagination,
+            continuation_model=self.model.continuation(),
+            imagination_horizon=size.imagination_horizon,
+        )
+        actor_loss.make_value_estimator(ValueEstimators.TDLambda, gamma=GAMMA, lmbda=LAMBDA)
+        value_loss = DreamerV3ValueLoss(
+            critic, value_loss="two_hot", actor_loss=actor_loss, slow_critic_regularization=1.0
+        )
+        return GoalConditionedDreamerLoss(model_loss, actor_loss, value_loss, goal_source=goal_source)
+
+
+def _inputs(goal_features: int) -> list[NestedKey]:
+    """What actor and critic see."""
+    return [("latent", "state"), ("latent", "belief"), *([GOAL] if goal_features else [])]
+
+
+def _clamp(action: Tensor) -> Tensor:
+    return action.clamp(-1, 1)

@@ -1,0 +1,78 @@
+"""What there is to choose: agents as rows, and sizes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """One row of the table of agents (docs/agents.md).
+
+    Args:
+        world_model: Which world model.
+        goal: How a goal position becomes what policy and critic see beside the latent; ``"none"``: not at all.
+        reward: The reward in imagination: the learned head, or the distance of the decoded position to the goal.
+        goal_source: Where goals in imagination come from: ``"environment"`` (in the observations), or ``"uniform"`` in
+            the workspace for each imagined start.
+        observed: Vectors that the world model sees and reconstructs, beside the image.
+        lambda_proprio: Weight of the reconstruction of proprioception.
+        lambda_object_position: Weight of the reconstruction of the object positions.
+        lambda_goal_position: Weight of the reconstruction of the goal position.
+    """
+
+    world_model: Literal["flat"] = "flat"
+    goal: Literal["none", "position"] = "none"
+    reward: Literal["head", "position_distance"] = "head"
+    goal_source: Literal["environment", "uniform"] = "environment"
+    observed: tuple[Literal["proprio", "object_position", "goal_position"], ...] = ("proprio", "object_position")
+    lambda_proprio: float = 1.0
+    lambda_object_position: float = 5.0
+    lambda_goal_position: float = 1.0
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large a model is, how much it sees per update and how fast it learns.
+
+    Args:
+        cnn_depth: Channels of the CNN's first stage before its multiplier.
+        cnn_mults: Channel multiplier of each stage; each halves the image.
+        categoricals: Categorical variables of the stochastic state.
+        classes: Classes of each.
+        belief: Features of the deterministic state, a multiple of ``gru_blocks``.
+        hidden: Units in the layers of the RSSM.
+        gru_blocks: Blocks of the recurrent layer.
+        mlp_layers: Hidden layers of encoder, decoders and heads for vectors, of actor and critic.
+        mlp_units: Units of each.
+        batch_size: Sequences per update.
+        slice_len: Frames per sequence.
+        imagination_horizon: Imagined steps from each frame.
+        model_lr: Learning rate of the world model.
+        actor_lr: Learning rate of the actor.
+        value_lr: Learning rate of the critic.
+        warmup: Updates until the learning rates are reached.
+    """
+
+    cnn_depth: int
+    cnn_mults: tuple[int, ...]
+    categoricals: int
+    classes: int
+    belief: int
+    hidden: int
+    gru_blocks: int
+    mlp_layers: int
+    mlp_units: int
+    batch_size: int
+    slice_len: int
+    imagination_horizon: int
+    model_lr: float
+    actor_lr: float
+    value_lr: float
+    warmup: int
+
+    def architecture(self) -> dict[str, Any]:
+        """The part that shapes the world model's networks."""
+        names = [field.name for field in fields(self)]
+        return {name: getattr(self, name) for name in names[: names.index("mlp_units") + 1]}

@@ -1,0 +1,92 @@
+"""Sequences to train on, sampled from a dataset with TorchRL's replay buffer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import SliceSampler, ReplayBuffer, TensorStorage
+from torchrl.envs import Compose, Transform
+
+from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
+from torchrl_ocwm.data.memory import release_pages
+
+
+class MemoryMappedStorage(TensorStorage):
+    """A storage over memory-mapped data that hands pages back after each read, so that its memory stays flat.
+
+    Args:
+        storage: Memory-mapped tensordict ``[N]``.
+    """
+
+    def get(self, index: Any) -> TensorDictBase:
+        data = super().get(index)
+        release_pages(self._storage)
+        return data
+
+
+class StackSlices(Transform):
+    """Give the time dimension back to sampled slices, ``[B * T]`` → ``[B, T]``, and mark their first records.
+
+    Args:
+        slice_len: T.
+    """
+
+    def __init__(self, slice_len: int) -> None:
+        super().__init__()
+        self.slice_len = slice_len
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        sequences = tensordict.reshape(-1, self.slice_len)
+        sequences["is_init"][:, 0] = True
+        return sequences
+
+
+def make_replay_buffer(
+    dataset: EpisodeDataset,
+    *,
+    batch_size: int,
+    slice_len: int,
+    transform: Transform | None = None,
+    exclude: tuple[tuple[str, ...] | str, ...] = (("next", "object_position_true"),),
+) -> ReplayBuffer:
+    """A replay buffer whose samples are sequences ``[B, T]`` of records that never cross an episode.
+
+    The first record of a sequence has ``is_init`` set, also in the middle of an episode: there the model starts from
+    the zero state without a previous action, as the policy does at the first frame of an episode.
+
+    Args:
+        dataset: Where to sample from.
+        batch_size: Sequences per batch B.
+        slice_len: Records per sequence T.
+        transform: Applied to each batch ``[B, T]``, for instance :class:`~torchrl_ocwm.data.RelabelGoals`.
+        exclude: Keys that are not read.
+
+    Raises:
+        DatasetError: if an episode is shorter than ``slice_len``.
+
+    Examples:
+        >>> import tempfile
+        >>> from tensordict import TensorDict
+        >>> records = TensorDict({"action": torch.zeros(9, 2), "is_init": (torch.arange(9) == 0).unsqueeze(-1),
+        ...     "next": {"observation": torch.rand(9, 4)}}, [9])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     dataset = EpisodeDataset.create(folder + "/data", example=records[0])
+        ...     dataset.append(records)
+        ...     make_replay_buffer(dataset, batch_size=2, slice_len=4, exclude=()).sample().batch_size
+        torch.Size([2, 4])
+    """
+    shortest = min(dataset.episode_lengths)
+    if slice_len > shortest:
+        raise DatasetError(
+            f"{dataset.path}: cannot cut sequences of {slice_len} frames, the shortest episode has {shortest}; "
+            "choose shorter sequences or collect longer episodes"
+        )
+    transforms = [StackSlices(slice_len), *([] if transform is None else [transform])]
+    return ReplayBuffer(
+        storage=MemoryMappedStorage(dataset.records.exclude(*exclude)),
+        sampler=SliceSampler(slice_len=slice_len, trajectories=dataset.trajectories, cache_values=True),
+        transform=Compose(*transforms),
+        batch_size=batch_size * slice_len,
+    )

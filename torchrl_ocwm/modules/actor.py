@@ -1,0 +1,40 @@
+"""The policy's network."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torchrl.modules import DreamerV3MLP
+
+
+class Actor(nn.Module):
+    """Mean and standard deviation of a bounded normal policy, as in DreamerV3.
+
+    Args:
+        in_features: Features of all inputs together.
+        action: Number of actions A.
+        layers: Hidden layers.
+        units: Units of each.
+        min_std: Smallest standard deviation.
+        max_std: Largest.
+
+    Called with latents ``[..., any]``; returns mean ``[..., A]`` in (−1, 1) and standard deviation ``[..., A]``,
+    float32.
+
+    Examples:
+        >>> mean, std = Actor(6, 2, layers=1, units=8)(torch.zeros(3, 4), torch.zeros(3, 2))
+        >>> mean.shape, bool((std >= 0.1).all())
+        (torch.Size([3, 2]), True)
+    """
+
+    def __init__(
+        self, in_features: int, action: int, *, layers: int, units: int, min_std: float = 0.1, max_std: float = 1.0
+    ) -> None:
+        super().__init__()
+        # A small last layer: the first policy is centred and as wide as it can be.
+        self.mlp = DreamerV3MLP(in_features, 2 * action, depth=layers, num_cells=units, outscale=0.01)
+        self.min_std, self.max_std = min_std, max_std
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        mean, spread = self.mlp(*inputs).float().chunk(2, -1)
+        return mean.tanh(), self.min_std + (self.max_std - self.min_std) * torch.sigmoid(spread + 2)

@@ -1,0 +1,60 @@
+"""The world model as an environment that carries a goal."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs.model_based import DreamerEnv
+from torchrl.modules import WorldModelWrapper
+
+
+class ImaginationEnv(DreamerEnv):
+    """Imagine with a world model, towards a goal that stays fixed.
+
+    The state is one nested entry, ``latent = {state, belief, goal}``: in a goal-conditioned problem the goal is part of
+    the state. TorchRL's Dreamer losses take it whole when their keys ``state`` and ``belief`` are both set to
+    ``"latent"``.
+
+    Args:
+        transition: Writes the next ``("latent", "state")`` and ``("latent", "belief")`` from these and ``action``.
+        reward: Writes ``reward`` ``[*batch, 1]`` from the next ``latent``.
+        state: Features of the stochastic state S.
+        belief: Features of the deterministic state H.
+        action: Number of actions A.
+        goal: Features of the goal G; 0 for a world without one.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict.nn import TensorDictModule
+        >>> keys = [("latent", "state"), ("latent", "belief")]
+        >>> transition = TensorDictModule(lambda s, b, a: (s + a, b), in_keys=[*keys, "action"], out_keys=keys)
+        >>> reward = TensorDictModule(lambda s, g: s - g, in_keys=[keys[0], ("latent", "goal")], out_keys=["reward"])
+        >>> env = ImaginationEnv(transition, reward, state=1, belief=1, action=1, goal=1)
+        >>> rollout = env.rollout(3, tensordict=env.reset().expand(5).clone(), auto_reset=False)
+        >>> rollout["next", "latent", "goal"].shape
+        torch.Size([5, 3, 1])
+    """
+
+    def __init__(
+        self,
+        transition: TensorDictModuleBase,
+        reward: TensorDictModuleBase,
+        *,
+        state: int,
+        belief: int,
+        action: int,
+        goal: int = 0,
+    ) -> None:
+        super().__init__(
+            WorldModelWrapper(transition, reward), prior_shape=(state,), belief_shape=(belief,), device=None
+        )
+        sizes = {"state": state, "belief": belief, **({"goal": goal} if goal else {})}
+        latent = Composite({name: Unbounded((size,)) for name, size in sizes.items()})
+        self.observation_spec = Composite(latent=latent)
+        self.state_spec = self.observation_spec.clone()
+        self.action_spec = Bounded(-1, 1, (action,))
+        self.reward_spec = Unbounded((1,))
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:  # noqa: ARG002
+        return self.state_spec.rand() if tensordict is None else tensordict.clone()

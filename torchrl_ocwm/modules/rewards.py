@@ -1,0 +1,80 @@
+"""Rewards in imagination: any module that writes ``reward``."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from torchrl_ocwm.modules.units import WorkspaceUnits
+
+
+def position_distance(position: Tensor, goal: Tensor, epsilon: float = 1e-6) -> Tensor:
+    """−‖p − p_g‖₂, smooth at the goal so that its gradient is finite there (paper, equations 1 and 3).
+
+    Args:
+        position: ``[..., D]``.
+        goal: ``[..., D]``, same unit.
+        epsilon: The distance is at least this.
+
+    Returns:
+        ``[..., 1]``, in the unit of the arguments.
+
+    Examples:
+        >>> position_distance(torch.tensor([3.0, 4.0]), torch.zeros(2))
+        tensor([-5.])
+    """
+    return -(position - goal).square().sum(-1, keepdim=True).clamp_min(epsilon**2).sqrt()
+
+
+class PositionDistance(nn.Module):
+    """:func:`position_distance` of one object, from workspace units to metres.
+
+    Args:
+        units: Workspace units of both positions.
+        object_index: Which object is to be positioned.
+
+    Called with positions ``[..., O * D]`` and goals ``[..., D]``, both in workspace units; returns ``[..., 1]`` metres.
+    """
+
+    def __init__(self, units: WorkspaceUnits, object_index: int = 0) -> None:
+        super().__init__()
+        self.units, self.object_index = units, object_index
+
+    def forward(self, positions: Tensor, goal: Tensor) -> Tensor:
+        position = positions.unflatten(-1, (-1, self.units.dim))[..., self.object_index, :]
+        return position_distance(self.units.to_metres(position), self.units.to_metres(goal))  # Eq. 3
+
+
+class PositionDistanceReward(TensorDictModule):
+    """The negative distance in metres between the decoded position of an object and the goal position.
+
+    Reward of the position-conditioned policy (paper, equation 3).
+
+    Args:
+        units: Workspace units of both positions.
+        object_index: Which object is to be positioned.
+        position_key: Decoded positions, ``[..., O * D]`` in workspace units.
+        goal_key: Goal position, ``[..., D]`` in workspace units.
+        reward_key: Key written, ``[..., 1]`` metres.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> reward = PositionDistanceReward(WorkspaceUnits((-0.2, -0.2), (0.2, 0.2)))
+        >>> data = TensorDict({"object_units": torch.tensor([[0.0, 0.5]]), "latent": {"goal": torch.zeros(1, 2)}}, [1])
+        >>> reward(data)["reward"]
+        tensor([[-0.1000]])
+    """
+
+    def __init__(
+        self,
+        units: WorkspaceUnits,
+        *,
+        object_index: int = 0,
+        position_key: NestedKey = "object_units",
+        goal_key: NestedKey = ("latent", "goal"),
+        reward_key: NestedKey = "reward",
+    ) -> None:
+        distance = PositionDistance(units, object_index)
+        super().__init__(distance, in_keys=[position_key, goal_key], out_keys=[reward_key])

@@ -1,0 +1,252 @@
+"""The flat world model: one latent state for the whole scene."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor, nn
+from torchrl.modules import (
+    DreamerV3ImageDecoder,
+    DreamerV3MLP,
+    RSSMPosteriorV3,
+    RSSMPriorV3,
+    RSSMRolloutV3,
+    RSSMStateEstimatorV3,
+    SymExpTwoHot,
+)
+
+from torchrl_ocwm.modules.latent import InitialLatent
+from torchrl_ocwm.modules.observation import ObservationEncoder
+from torchrl_ocwm.modules.units import WorkspaceUnits
+
+VectorName = Literal["proprio", "object_position", "goal_position"]
+_KEYS: dict[str, str] = {"proprio": "proprio", "object_position": "object_units", "goal_position": "goal_units"}
+UNIMIX = 0.01
+
+
+class FlatWorldModel(nn.Module):
+    """Encoder, discrete RSSM, decoders and heads, as TensorDictModules for training, imagination and acting.
+
+    The networks exist once; each method gives a module that applies them to the keys of one place:
+    :meth:`records` to sequences of records, :meth:`transition`, :meth:`object_position`, :meth:`reward` and
+    :meth:`continuation` to imagined latents, :meth:`filter` to the observations that a policy acts on.
+
+    Args:
+        image_size: Height and width of the images, pixels.
+        proprio: Number of proprioceptive values P.
+        objects: Number of objects O.
+        action: Number of actions A.
+        units: Workspace units of the positions.
+        observed: Vectors that the encoder sees and the decoder reconstructs.
+        reward_head: Whether to predict the reward.
+        cnn_depth: Channels of the CNN's first stage before its multiplier.
+        cnn_mults: Channel multiplier of each stage.
+        categoricals: Categorical variables of the stochastic state.
+        classes: Classes of each.
+        belief: Features of the deterministic state H, a multiple of ``gru_blocks``.
+        hidden: Units in the layers of the RSSM.
+        gru_blocks: Blocks of the recurrent layer.
+        mlp_layers: Hidden layers of the vector encoder, decoders and heads.
+        mlp_units: Units of each.
+
+    Examples:
+        >>> from torchrl_ocwm.testing import random_records, reacher_task
+        >>> from torchrl_ocwm.agents import build_agent
+        >>> model = build_agent("dreamer_pcp", reacher_task(), size="debug").model
+        >>> records = model.records()(random_records(reacher_task(), 2, 5))
+        >>> records["next", "reco_pixels"].shape
+        torch.Size([2, 5, 3, 64, 64])
+    """
+
+    def __init__(
+        self,
+        *,
+        image_size: int,
+        proprio: int,
+        objects: int,
+        action: int,
+        units: WorkspaceUnits,
+        observed: tuple[VectorName, ...],
+        reward_head: bool,
+        cnn_depth: int,
+        cnn_mults: tuple[int, ...],
+        categoricals: int,
+        classes: int,
+        belief: int,
+        hidden: int,
+        gru_blocks: int,
+        mlp_layers: int,
+        mlp_units: int,
+    ) -> None:
+        super().__init__()
+        self.action, self.state, self.belief = action, categoricals * classes, belief
+        self.units, self.observed = units, tuple(observed)
+        sizes = {"proprio": proprio, "object_position": objects * units.dim, "goal_position": units.dim}
+        vectors = {name: sizes[name] for name in self.observed}
+        self.encoder = ObservationEncoder(
+            image_size,
+            sum(vectors.values()),
+            cnn_depth=cnn_depth,
+            cnn_mults=cnn_mults,
+            mlp_layers=mlp_layers,
+            mlp_units=mlp_units,
+        )
+        self.prior = RSSMPriorV3(
+            action_shape=(action,),
+            action_dim=action,
+            hidden_dim=hidden,
+            rnn_hidden_dim=belief,
+            num_categoricals=categoricals,
+            num_classes=classes,
+            recurrent_model="block_gru",
+            num_blocks=gru_blocks,
+            unimix=UNIMIX,
+        )
+        self.posterior = RSSMPosteriorV3(
+            hidden_dim=hidden,
+            rnn_hidden_dim=belief,
+            obs_embed_dim=self.encoder.features,
+            num_categoricals=categoricals,
+            num_classes=classes,
+            use_rms_norm=True,
+            unimix=UNIMIX,
+        )
+        latent = self.latent_features
+        self.image_decoder = DreamerV3ImageDecoder(
+            latent, (3, image_size, image_size), depth=cnn_depth, mults=tuple(cnn_mults), num_blocks=1
+        )
+        self.vector_decoders = nn.ModuleDict(
+            {name: DreamerV3MLP(latent, size, depth=mlp_layers, num_cells=mlp_units) for name, size in vectors.items()}
+        )
+        self.continue_head = DreamerV3MLP(latent, 1, depth=1, num_cells=mlp_units)
+        self.two_hot = SymExpTwoHot()
+        self.reward_head = None
+        if reward_head:
+            self.reward_head = DreamerV3MLP(
+                latent, self.two_hot.num_bins, depth=mlp_layers, num_cells=mlp_units, outscale=0.0
+            )
+
+    @property
+    def latent_features(self) -> int:
+        """Features of state and belief together."""
+        return self.state + self.belief
+
+    # Modules for training on records.
+
+    def records(self) -> TensorDictSequential:
+        """Posterior, prior and predictions for records ``[B, T]``; everything is read and written under ``next``."""
+        rollout = RSSMRolloutV3(
+            TensorDictModule(
+                self.prior,
+                in_keys=["state", "belief", "action"],
+                out_keys=[("next", "prior_logits"), ("next", "state"), ("next", "belief")],
+            ),
+            TensorDictModule(
+                self.posterior,
+                in_keys=[("next", "belief"), ("next", "encoded_latents")],
+                out_keys=[("next", "posterior_logits"), ("next", "state")],
+            ),
+        )
+        return TensorDictSequential(
+            InitialLatent(self.state, self.belief), *self._encode("next"), rollout, *self.decoders("next")
+        )
+
+    def decoders(self, *at: str) -> list[TensorDictModuleBase]:
+        """Predictions of all that was observed, and of reward and continuation, from the latent at a place."""
+        latent = _latent(at)
+        modules: list[TensorDictModuleBase] = [TensorDictModule(self.image_decoder, latent, [_key(at, "reco_pixels")])]
+        modules += [
+            TensorDictModule(decoder, latent, [_key(at, f"reco_{_KEYS[name]}")])
+            for name, decoder in self.vector_decoders.items()
+        ]
+        if self.reward_head is not None:
+            modules.append(TensorDictModule(self.reward_head, latent, [_key(at, "reward_logits")]))
+            modules.append(TensorDictModule(self.two_hot, [_key(at, "reward_logits")], [_key(at, "reward")]))
+        modules.append(TensorDictModule(self.continue_head, latent, [_key(at, "continue_pred")]))
+        return modules
+
+    def _encode(self, *at: str) -> list[TensorDictModuleBase]:
+        """Positions to workspace units, then all that is observed to ``encoded_latents``."""
+        modules: list[TensorDictModuleBase] = []
+        if "object_position" in self.observed:
+            flatten = _ObjectUnits(self.units)
+            modules.append(TensorDictModule(flatten, [_key(at, "object_position")], [_key(at, "object_units")]))
+        if "goal_position" in self.observed:
+            modules.append(TensorDictModule(self.units, [_key(at, "goal_position")], [_key(at, "goal_units")]))
+        inputs = [_key(at, "pixels"), *(_key(at, _KEYS[name]) for name in self.observed)]
+        return [*modules, TensorDictModule(self.encoder, inputs, [_key(at, "encoded_latents")])]
+
+    # Modules for imagination, on ``latent = {state, belief, goal}``.
+
+    def transition(self) -> TensorDictModule:
+        """Next state and belief, sampled from the prior."""
+        latent: list[NestedKey] = _latent(("latent",))
+        return TensorDictModule(self.prior, [*latent, "action"], ["_", *latent])
+
+    def object_position(self) -> TensorDictModule:
+        """Decoded object positions ``object_units`` ``[..., O * D]``, in workspace units.
+
+        Raises:
+            ValueError: if the model does not decode them.
+        """
+        if "object_position" not in self.vector_decoders:
+            raise ValueError("this world model does not decode object positions; add 'object_position' to `observed`")
+        return TensorDictModule(self.vector_decoders["object_position"], _latent(("latent",)), ["object_units"])
+
+    def reward(self) -> TensorDictSequential:
+        """Predicted reward ``[..., 1]``.
+
+        Raises:
+            ValueError: if the model has no reward head.
+        """
+        if self.reward_head is None:
+            raise ValueError("this world model has no reward head; build it with reward_head=True")
+        return TensorDictSequential(
+            TensorDictModule(self.reward_head, _latent(("latent",)), ["reward_logits"]),
+            TensorDictModule(self.two_hot, ["reward_logits"], ["reward"]),
+        )
+
+    def continuation(self) -> TensorDictSequential:
+        """Predicted probability ``continuation`` ``[..., 1]`` that the episode goes on."""
+        return TensorDictSequential(
+            TensorDictModule(self.continue_head, _latent(("latent",)), ["continue_pred"]),
+            TensorDictModule(torch.sigmoid, ["continue_pred"], ["continuation"]),
+        )
+
+    # Modules for acting.
+
+    def filter(self) -> TensorDictSequential:
+        """Posterior of the current observation, from the latent and the action of the step before.
+
+        Reads observations, ``is_init`` and ``latent = {state, belief, action}``; writes the new state and belief.
+        """
+        latent = _latent(("latent",))
+        estimator = RSSMStateEstimatorV3(
+            self.prior,
+            self.posterior,
+            in_keys=[*latent, ("latent", "action"), "encoded_latents", "is_init"],
+            out_keys=latent,
+        )
+        return TensorDictSequential(*self._encode(), estimator)
+
+
+class _ObjectUnits(nn.Module):
+    """Object positions ``[..., O, D]`` in metres to ``[..., O * D]`` in workspace units."""
+
+    def __init__(self, units: WorkspaceUnits) -> None:
+        super().__init__()
+        self.units = units
+
+    def forward(self, metres: Tensor) -> Tensor:
+        return self.units(metres).flatten(-2)
+
+
+def _key(at: tuple[str, ...], name: str) -> NestedKey:
+    return unravel_key((*at, name))
+
+
+def _latent(at: tuple[str, ...]) -> list[NestedKey]:
+    return [_key(at, "state"), _key(at, "belief")]

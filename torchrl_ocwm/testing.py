@@ -1,0 +1,48 @@
+"""Small inputs for doctests, tests and benchmarks; no simulator needed."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.envs.workspace import Workspace
+
+
+def reacher_task(image_size: int = 64) -> Task:
+    """The shapes of Reacher."""
+    workspace = Workspace(low=(-0.24, -0.24), high=(0.24, 0.24), reach=(0.042, 0.24))
+    return Task("reacher", image_size, ("finger",), 5, 2, workspace)
+
+
+def random_records(task: Task, batch: int, time: int, *, seed: int = 0) -> TensorDict:
+    """Random records ``[batch, time]`` of a task, the first of each sequence with ``is_init`` set."""
+    generator = torch.Generator().manual_seed(seed)
+    shape, size, objects = (batch, time), task.image_size, len(task.objects)
+
+    def uniform(*features: int) -> torch.Tensor:
+        return torch.rand(*shape, *features, generator=generator)
+
+    is_init = torch.zeros(*shape, 1, dtype=torch.bool)
+    is_init[:, 0] = True
+    position = torch.stack([task.workspace.sample(shape, generator) for _ in range(objects)], -2)
+    goal = task.workspace.sample((batch, 1), generator).expand(*shape, -1).clone()
+    done = torch.zeros(*shape, 1, dtype=torch.bool)
+    return TensorDict(
+        {
+            "action": 2 * uniform(task.action) - 1,
+            "is_init": is_init,
+            "next": {
+                "pixels": (256 * uniform(3, size, size)).to(torch.uint8),
+                "masks": uniform(objects, size, size) > 0.9,
+                "proprio": uniform(task.proprio),
+                "object_position": position,
+                "object_visible": torch.ones(*shape, objects, dtype=torch.bool),
+                "goal_position": goal,
+                "reward": -(position[..., 0, :] - goal).norm(dim=-1, keepdim=True),
+                "done": done,
+                "terminated": done.clone(),
+            },
+        },
+        shape,
+    )
