@@ -1,8 +1,10 @@
 """Which agents there are: rows of choices, and the builder that wires them."""
 
-from torchrl_ocwm.agents.agent import Agent
+from torchrl_ocwm.agents.agent import Agent, Policy
 from torchrl_ocwm.agents.build import build_agent
+from torchrl_ocwm.agents.checkpoint import load_agent
 from torchrl_ocwm.agents.config import AgentConfig, Size
 from torchrl_ocwm.agents.presets import AGENTS, SIZES
 
-__all__ = ["AGENTS", "SIZES", "Agent", "AgentConfig", "Size", "build_agent"]
+__all__ = ["AGENTS", "SIZES", "Agent", "AgentConfig",
+    "Policy", "Size", "build_agent", "load_agent"]

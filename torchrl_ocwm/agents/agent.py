@@ -15,7 +15,7 @@ from tensordict.nn import (
 )
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.modules import DreamerV3MLP, IndependentNormal, SymExpTwoHot
+from torchrl.modules import IndependentNormal, SymExpTwoHot
 from torchrl.objectives import DreamerV3ActorLoss, DreamerV3ValueLoss, ValueEstimators
 
 from torchrl_ocwm.agents.config import AgentConfig, Size
@@ -29,9 +29,10 @@ from torchrl_ocwm.modules import (
     UniformGoals,
     WorkspaceUnits,
 )
+from torchrl_ocwm.modules.networks import make_mlp
 from torchrl_ocwm.objectives import GoalConditionedDreamerLoss, WorldModelLoss
 
-GAMMA, LAMBDA = 0.99, 0.95
+LAMBDA = 0.95
 GOAL: NestedKey = ("latent", "goal")
 
 
@@ -85,6 +86,22 @@ GOAL_SOURCES: dict[str, Callable[[FlatWorldModel], TensorDictModuleBase | None]]
 }
 
 
+class Policy(TensorDictSequential):
+    """The policy of an agent, as a module that runs in any rollout of an environment of the agent's task.
+
+    Reads the observations, ``goal_position`` ``[..., D]`` in metres and ``is_init``; writes ``action``, and ``latent``,
+    which it reads back at the next step. Actions are drawn from the actor, or are its mean under
+    ``set_exploration_type(ExplorationType.DETERMINISTIC)``.
+
+    Attributes:
+        agent: The agent that it belongs to.
+    """
+
+    def __init__(self, agent: Agent, *modules: TensorDictModuleBase) -> None:
+        super().__init__(*modules)
+        self.__dict__["agent"] = agent  # not a submodule: the modules hold the parameters
+
+
 class Agent(nn.Module):
     """A world model, an actor and a critic for one task.
 
@@ -126,18 +143,14 @@ class Agent(nn.Module):
         source = None if goal_source is None else TensorDictSequential(goal_source, goal_encoder)
         self.loss = self._make_loss(self._make_critic(goal_features), source)
 
-    def policy(self) -> TensorDictSequential:
-        """The policy that acts, as a module that runs in any rollout of an environment of the task.
-
-        Reads the observations, ``goal_position`` ``[..., D]`` in metres and ``is_init``; writes ``action``. It carries
-        its latent in the tensordict. Actions are drawn from the actor, or its mean under
-        ``set_exploration_type(ExplorationType.DETERMINISTIC)``.
-        """
+    def policy(self) -> Policy:
+        """The policy, sharing the agent's parameters."""
         model = self.model
         goal: list[TensorDictModuleBase] = []
         if self.goal_encoder is not None:
             goal = [TensorDictModule(model.units, ["goal_position"], ["goal_units"]), self.goal_encoder]
-        return TensorDictSequential(
+        return Policy(
+            self,
             ActingLatent(model.state, model.belief, self.task.action),
             model.filter(),
             *goal,
@@ -150,7 +163,11 @@ class Agent(nn.Module):
     def _make_actor(self, goal_features: int) -> ProbabilisticTensorDictSequential:
         size = self.size
         network = Actor(
-            self.model.latent_features + goal_features, self.task.action, layers=size.mlp_layers, units=size.mlp_units
+            self.model.latent_features + goal_features,
+            self.task.action,
+            layers=size.mlp_layers,
+            units=size.mlp_units,
+            style=size.style,
         )
         return ProbabilisticTensorDictSequential(
             TensorDictModule(network, _inputs(goal_features), ["loc", "scale"]),
@@ -165,11 +182,12 @@ class Agent(nn.Module):
 
     def _make_critic(self, goal_features: int) -> TensorDictSequential:
         two_hot, size = SymExpTwoHot(), self.size
-        network = DreamerV3MLP(
+        network = make_mlp(
+            size.style,
             self.model.latent_features + goal_features,
             two_hot.num_bins,
-            depth=size.mlp_layers,
-            num_cells=size.mlp_units,
+            layers=size.mlp_layers,
+            units=size.mlp_units,
             outscale=0.0,
         )
         return TensorDictSequential(
@@ -193,8 +211,9 @@ class Agent(nn.Module):
             self.imagination,
             continuation_model=self.model.continuation(),
             imagination_horizon=size.imagination_horizon,
+            entropy_bonus=size.entropy_bonus,
         )
-        actor_loss.make_value_estimator(ValueEstimators.TDLambda, gamma=GAMMA, lmbda=LAMBDA)
+        actor_loss.make_value_estimator(ValueEstimators.TDLambda, gamma=size.gamma, lmbda=LAMBDA)
         value_loss = DreamerV3ValueLoss(
             critic, value_loss="two_hot", actor_loss=actor_loss, slow_critic_regularization=1.0
         )

@@ -28,7 +28,7 @@ class AgentConfig:
     goal_source: Literal["environment", "uniform"] = "environment"
     observed: tuple[Literal["proprio", "object_position", "goal_position"], ...] = ("proprio", "object_position")
     lambda_proprio: float = 1.0
-    lambda_object_position: float = 5.0
+    lambda_object_position: float = 200.0
     lambda_goal_position: float = 1.0
 
 
@@ -37,6 +37,7 @@ class Size:
     """How large a model is, how much it sees per update and how fast it learns.
 
     Args:
+        style: Which layers: ``"dreamer_v3"`` or ``"dreamer_v2"`` (:mod:`torchrl_ocwm.modules.networks`).
         cnn_depth: Channels of the CNN's first stage before its multiplier.
         cnn_mults: Channel multiplier of each stage; each halves the image.
         categoricals: Categorical variables of the stochastic state.
@@ -53,8 +54,11 @@ class Size:
         actor_lr: Learning rate of the actor.
         value_lr: Learning rate of the critic.
         warmup: Updates until the learning rates are reached.
+        gamma: Discount of a step in imagination.
+        entropy_bonus: Weight of the actor's entropy.
     """
 
+    style: Literal["dreamer_v3", "dreamer_v2"]
     cnn_depth: int
     cnn_mults: tuple[int, ...]
     categoricals: int
@@ -71,6 +75,8 @@ class Size:
     actor_lr: float
     value_lr: float
     warmup: int
+    gamma: float = 0.99
+    entropy_bonus: float = 3e-4
 
     def architecture(self) -> dict[str, Any]:
         """The part that shapes the world model's networks."""

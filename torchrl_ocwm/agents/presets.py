@@ -11,27 +11,27 @@ AGENTS = {
 
 SIZES = {
     "debug": Size(
-        cnn_depth=2, cnn_mults=(1, 2, 2, 2), categoricals=4, classes=4, belief=16, hidden=16, gru_blocks=2,
+        style="dreamer_v3", cnn_depth=2, cnn_mults=(1, 2, 2, 2), categoricals=4, classes=4, belief=16, hidden=16, gru_blocks=2,
         mlp_layers=1, mlp_units=16, batch_size=2, slice_len=8, imagination_horizon=3,
         model_lr=1e-3, actor_lr=1e-3, value_lr=1e-3, warmup=0,
     ),
     "cpu": Size(
-        cnn_depth=8, cnn_mults=(1, 2, 4, 4), categoricals=16, classes=16, belief=256, hidden=128, gru_blocks=8,
+        style="dreamer_v3", cnn_depth=8, cnn_mults=(1, 2, 4, 4), categoricals=16, classes=16, belief=256, hidden=128, gru_blocks=8,
         mlp_layers=2, mlp_units=128, batch_size=8, slice_len=16, imagination_horizon=10,
         model_lr=5e-4, actor_lr=3e-4, value_lr=3e-4, warmup=100,
     ),
     "small": Size(
-        cnn_depth=24, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=16, belief=512, hidden=256, gru_blocks=8,
+        style="dreamer_v3", cnn_depth=24, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=16, belief=512, hidden=256, gru_blocks=8,
         mlp_layers=3, mlp_units=256, batch_size=16, slice_len=32, imagination_horizon=15,
         model_lr=3e-4, actor_lr=1e-4, value_lr=1e-4, warmup=500,
     ),
     "paper": Size(
-        cnn_depth=48, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=32, belief=200, hidden=200, gru_blocks=8,
+        style="dreamer_v3", cnn_depth=48, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=32, belief=200, hidden=200, gru_blocks=8,
         mlp_layers=4, mlp_units=400, batch_size=32, slice_len=32, imagination_horizon=15,
         model_lr=3e-4, actor_lr=8e-5, value_lr=8e-5, warmup=1000,
     ),
     "large": Size(
-        cnn_depth=64, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=64, belief=2048, hidden=512, gru_blocks=8,
+        style="dreamer_v3", cnn_depth=64, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=64, belief=2048, hidden=512, gru_blocks=8,
         mlp_layers=3, mlp_units=512, batch_size=32, slice_len=64, imagination_horizon=15,
         model_lr=1e-4, actor_lr=4e-5, value_lr=4e-5, warmup=1000,
     ),

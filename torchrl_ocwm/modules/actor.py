@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torchrl.modules import DreamerV3MLP
+
+from torchrl_ocwm.modules.networks import Style, make_mlp
 
 
 class Actor(nn.Module):
@@ -17,6 +18,7 @@ class Actor(nn.Module):
         units: Units of each.
         min_std: Smallest standard deviation.
         max_std: Largest.
+        style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
 
     Called with latents ``[..., any]``; returns mean ``[..., A]`` in (−1, 1) and standard deviation ``[..., A]``,
     float32.
@@ -28,11 +30,19 @@ class Actor(nn.Module):
     """
 
     def __init__(
-        self, in_features: int, action: int, *, layers: int, units: int, min_std: float = 0.1, max_std: float = 1.0
+        self,
+        in_features: int,
+        action: int,
+        *,
+        layers: int,
+        units: int,
+        min_std: float = 0.1,
+        max_std: float = 1.0,
+        style: Style = "dreamer_v3",
     ) -> None:
         super().__init__()
         # A small last layer: the first policy is centred and as wide as it can be.
-        self.mlp = DreamerV3MLP(in_features, 2 * action, depth=layers, num_cells=units, outscale=0.01)
+        self.mlp = make_mlp(style, in_features, 2 * action, layers=layers, units=units, outscale=0.01)
         self.min_std, self.max_std = min_std, max_std
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from tensordict import TensorDictBase
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs.model_based import DreamerEnv
@@ -55,6 +59,42 @@ class ImaginationEnv(DreamerEnv):
         self.state_spec = self.observation_spec.clone()
         self.action_spec = Bounded(-1, 1, (action,))
         self.reward_spec = Unbounded((1,))
+
+    def rollout(
+        self,
+        max_steps: int,
+        policy: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        *args: Any,
+        **kwargs: Any,
+    ) -> TensorDictBase:
+        """Imagine ``max_steps`` steps; takes the arguments of :meth:`torchrl.envs.EnvBase.rollout`.
+
+        A rollout of fixed length from given states, as the losses ask for, runs without the checks that an environment
+        needs: on a CPU these take as long as the networks.
+        """
+        plain = policy is not None and set(kwargs) == {"auto_reset", "tensordict", "break_when_any_done"}
+        if args or not plain or kwargs["auto_reset"] or kwargs["break_when_any_done"]:
+            return super().rollout(max_steps, policy, *args, **kwargs)
+        assert policy is not None
+        step = kwargs["tensordict"].select("latent")
+        latents, actions, rewards = [step["latent"]], [], []
+        for _ in range(max_steps):
+            step = policy(step)
+            actions.append(step["action"])
+            step = self.world_model(step.select("latent", "action").copy())
+            latents.append(step["latent"])
+            rewards.append(step["reward"])
+            step = step.select("latent")
+        time = step.ndim
+        states = torch.stack(latents, time)
+        return TensorDict(
+            {
+                "latent": states[..., :-1],
+                "action": torch.stack(actions, time),
+                "next": {"latent": states[..., 1:], "reward": torch.stack(rewards, time)},
+            },
+            [*step.batch_size, max_steps],
+        )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:  # noqa: ARG002
         return self.state_spec.rand() if tensordict is None else tensordict.clone()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torchrl.modules import DreamerV3ImageEncoder, DreamerV3MLP
 from torchrl.objectives import symlog
+
+from torchrl_ocwm.modules.networks import Style, make_image_encoder, make_mlp
 
 
 class ObservationEncoder(nn.Module):
@@ -18,6 +19,7 @@ class ObservationEncoder(nn.Module):
         cnn_mults: Channel multiplier of each stage; each halves the image.
         mlp_layers: Hidden layers of the MLP.
         mlp_units: Units of each.
+        style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
 
     Called with ``pixels`` ``[..., 3, H, W]`` uint8 and vectors ``[..., any]`` float32; returns
     ``[..., features]`` float32.
@@ -41,14 +43,13 @@ class ObservationEncoder(nn.Module):
         cnn_mults: tuple[int, ...],
         mlp_layers: int,
         mlp_units: int,
+        style: Style = "dreamer_v3",
     ) -> None:
         super().__init__()
-        check_image_size(image_size, cnn_mults)
-        self.cnn = DreamerV3ImageEncoder(3, depth=cnn_depth, mults=tuple(cnn_mults))
-        self.features = self.cnn.output_features((3, image_size, image_size))
+        self.cnn, self.features = make_image_encoder(style, image_size, depth=cnn_depth, mults=cnn_mults)
         self.mlp = None
         if vector_features:
-            self.mlp = DreamerV3MLP(vector_features, None, depth=mlp_layers, num_cells=mlp_units)
+            self.mlp = make_mlp(style, vector_features, None, layers=mlp_layers, units=mlp_units)
             self.features += mlp_units
 
     def forward(self, pixels: Tensor, *vectors: Tensor) -> Tensor:
@@ -56,17 +57,3 @@ class ObservationEncoder(nn.Module):
         if self.mlp is None:
             return image
         return torch.cat([image, self.mlp(symlog(torch.cat(vectors, -1)))], -1)
-
-
-def check_image_size(image_size: int, cnn_mults: tuple[int, ...]) -> None:
-    """Say so if a CNN of these stages cannot halve an image of this size.
-
-    Raises:
-        ValueError: with the multiple that the size must be.
-    """
-    factor = 2 ** len(cnn_mults)
-    if image_size % factor:
-        raise ValueError(
-            f"a CNN of {len(cnn_mults)} stages halves the image {len(cnn_mults)} times, which an image of "
-            f"{image_size} x {image_size} pixels does not allow; use a multiple of {factor}"
-        )

@@ -8,23 +8,15 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.modules import (
-    DreamerV3ImageDecoder,
-    DreamerV3MLP,
-    RSSMPosteriorV3,
-    RSSMPriorV3,
-    RSSMRolloutV3,
-    RSSMStateEstimatorV3,
-    SymExpTwoHot,
-)
+from torchrl.modules import RSSMRolloutV3, RSSMStateEstimatorV3, SymExpTwoHot
 
 from torchrl_ocwm.modules.latent import InitialLatent
+from torchrl_ocwm.modules.networks import Style, make_image_decoder, make_mlp, make_rssm
 from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.units import WorkspaceUnits
 
 VectorName = Literal["proprio", "object_position", "goal_position"]
 _KEYS: dict[str, str] = {"proprio": "proprio", "object_position": "object_units", "goal_position": "goal_units"}
-UNIMIX = 0.01
 
 
 class FlatWorldModel(nn.Module):
@@ -51,6 +43,7 @@ class FlatWorldModel(nn.Module):
         gru_blocks: Blocks of the recurrent layer.
         mlp_layers: Hidden layers of the vector encoder, decoders and heads.
         mlp_units: Units of each.
+        style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
 
     Examples:
         >>> from torchrl_ocwm.testing import random_records, reacher_task
@@ -80,12 +73,14 @@ class FlatWorldModel(nn.Module):
         gru_blocks: int,
         mlp_layers: int,
         mlp_units: int,
+        style: Style = "dreamer_v3",
     ) -> None:
         super().__init__()
         self.action, self.state, self.belief = action, categoricals * classes, belief
         self.units, self.observed = units, tuple(observed)
         sizes = {"proprio": proprio, "object_position": objects * units.dim, "goal_position": units.dim}
         vectors = {name: sizes[name] for name in self.observed}
+        mlp = {"layers": mlp_layers, "units": mlp_units}
         self.encoder = ObservationEncoder(
             image_size,
             sum(vectors.values()),
@@ -93,41 +88,26 @@ class FlatWorldModel(nn.Module):
             cnn_mults=cnn_mults,
             mlp_layers=mlp_layers,
             mlp_units=mlp_units,
+            style=style,
         )
-        self.prior = RSSMPriorV3(
-            action_shape=(action,),
-            action_dim=action,
-            hidden_dim=hidden,
-            rnn_hidden_dim=belief,
-            num_categoricals=categoricals,
-            num_classes=classes,
-            recurrent_model="block_gru",
-            num_blocks=gru_blocks,
-            unimix=UNIMIX,
-        )
-        self.posterior = RSSMPosteriorV3(
-            hidden_dim=hidden,
-            rnn_hidden_dim=belief,
-            obs_embed_dim=self.encoder.features,
-            num_categoricals=categoricals,
-            num_classes=classes,
-            use_rms_norm=True,
-            unimix=UNIMIX,
+        self.prior, self.posterior = make_rssm(
+            style,
+            action=action,
+            embedding=self.encoder.features,
+            categoricals=categoricals,
+            classes=classes,
+            belief=belief,
+            hidden=hidden,
+            blocks=gru_blocks,
         )
         latent = self.latent_features
-        self.image_decoder = DreamerV3ImageDecoder(
-            latent, (3, image_size, image_size), depth=cnn_depth, mults=tuple(cnn_mults), num_blocks=1
-        )
+        self.image_decoder = make_image_decoder(style, latent, image_size, depth=cnn_depth, mults=cnn_mults)
         self.vector_decoders = nn.ModuleDict(
-            {name: DreamerV3MLP(latent, size, depth=mlp_layers, num_cells=mlp_units) for name, size in vectors.items()}
+            {name: make_mlp(style, latent, features, **mlp) for name, features in vectors.items()}
         )
-        self.continue_head = DreamerV3MLP(latent, 1, depth=1, num_cells=mlp_units)
+        self.continue_head = make_mlp(style, latent, 1, layers=1, units=mlp_units)
         self.two_hot = SymExpTwoHot()
-        self.reward_head = None
-        if reward_head:
-            self.reward_head = DreamerV3MLP(
-                latent, self.two_hot.num_bins, depth=mlp_layers, num_cells=mlp_units, outscale=0.0
-            )
+        self.reward_head = make_mlp(style, latent, self.two_hot.num_bins, outscale=0.0, **mlp) if reward_head else None
 
     @property
     def latent_features(self) -> int:
@@ -157,16 +137,19 @@ class FlatWorldModel(nn.Module):
     def decoders(self, *at: str) -> list[TensorDictModuleBase]:
         """Predictions of all that was observed, and of reward and continuation, from the latent at a place."""
         latent = _latent(at)
-        modules: list[TensorDictModuleBase] = [TensorDictModule(self.image_decoder, latent, [_key(at, "reco_pixels")])]
-        modules += [
-            TensorDictModule(decoder, latent, [_key(at, f"reco_{_KEYS[name]}")])
-            for name, decoder in self.vector_decoders.items()
-        ]
+        modules = [TensorDictModule(self.image_decoder, latent, [_key(at, "reco_pixels")]), *self.vectors(*at)]
         if self.reward_head is not None:
             modules.append(TensorDictModule(self.reward_head, latent, [_key(at, "reward_logits")]))
             modules.append(TensorDictModule(self.two_hot, [_key(at, "reward_logits")], [_key(at, "reward")]))
         modules.append(TensorDictModule(self.continue_head, latent, [_key(at, "continue_pred")]))
         return modules
+
+    def vectors(self, *at: str) -> list[TensorDictModule]:
+        """Predictions of the observed vectors from the latent at a place: ``reco_proprio``, ``reco_object_units``, …"""
+        return [
+            TensorDictModule(decoder, _latent(at), [_key(at, f"reco_{_KEYS[name]}")])
+            for name, decoder in self.vector_decoders.items()
+        ]
 
     def _encode(self, *at: str) -> list[TensorDictModuleBase]:
         """Positions to workspace units, then all that is observed to ``encoded_latents``."""
@@ -181,10 +164,13 @@ class FlatWorldModel(nn.Module):
 
     # Modules for imagination, on ``latent = {state, belief, goal}``.
 
-    def transition(self) -> TensorDictModule:
-        """Next state and belief, sampled from the prior."""
-        latent: list[NestedKey] = _latent(("latent",))
-        return TensorDictModule(self.prior, [*latent, "action"], ["_", *latent])
+    def transition(self) -> TensorDictSequential:
+        """Next state and belief, sampled from the prior. Actions beyond [−1, 1] count as clipped."""
+        latent = _latent(("latent",))
+        return TensorDictSequential(
+            TensorDictModule(_bounded, ["action"], ["bounded_action"]),
+            TensorDictModule(self.prior, [*latent, "bounded_action"], ["_", *latent]),
+        )
 
     def object_position(self) -> TensorDictModule:
         """Decoded object positions ``object_units`` ``[..., O * D]``, in workspace units.
@@ -242,6 +228,11 @@ class _ObjectUnits(nn.Module):
 
     def forward(self, metres: Tensor) -> Tensor:
         return self.units(metres).flatten(-2)
+
+
+def _bounded(action: Tensor) -> Tensor:
+    """Clip to [−1, 1] and keep a gradient beyond, as TorchRL's block GRU does by itself."""
+    return action / action.detach().abs().clamp_min(1)
 
 
 def _key(at: tuple[str, ...], name: str) -> NestedKey:

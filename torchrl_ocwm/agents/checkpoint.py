@@ -1,0 +1,97 @@
+"""Agents on disk, in TorchRL's checkpoints."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torchrl.checkpoint import Checkpoint, CheckpointError
+
+from torchrl_ocwm.agents.agent import Agent, Policy
+from torchrl_ocwm.agents.config import AgentConfig, Size
+from torchrl_ocwm.envs.task import Task
+
+T = TypeVar("T")
+
+
+def describe(agent: Agent) -> dict[str, Any]:
+    """What it takes to build an agent again; fits in JSON."""
+    return {"agent": asdict(agent.config), "size": asdict(agent.size), "task": agent.task.to_dict()}
+
+
+def rebuild(description: dict[str, Any]) -> Agent:
+    """An agent with fresh weights from what :func:`describe` gave."""
+    config, size = _dataclass(AgentConfig, description["agent"]), _dataclass(Size, description["size"])
+    return Agent(Task.from_dict(description["task"]), config, size)
+
+
+def load_agent(path: str | Path, *, device: torch.device | str = "cpu") -> Policy:
+    """Load a trained agent's policy from a checkpoint; no dataset and no simulator is needed.
+
+    Args:
+        path: A checkpoint that training wrote.
+        device: Where to put it.
+
+    Returns:
+        The policy (:meth:`Agent.policy`), a module that runs in any TorchRL rollout of the agent's task. Its
+        ``agent`` attribute is the whole agent.
+
+    Raises:
+        CheckpointError: if there is no checkpoint, or not one of an agent of this library.
+    """
+    path = Path(path)
+    agent = rebuild(read_description(path))
+    Checkpoint(loss_module=agent.loss).load(path, map_location=device)
+    agent.to(device).eval().requires_grad_(False)
+    return agent.policy()
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """The description of the agent in a checkpoint.
+
+    Raises:
+        CheckpointError: if there is no checkpoint, or not one of an agent of this library.
+    """
+    if not path.exists():
+        raise CheckpointError(f"{path}: no such checkpoint")
+    try:
+        components = Checkpoint.manifest(path)["components"]
+    except Exception as error:  # whatever a file that is no checkpoint makes a zip or JSON reader raise
+        raise CheckpointError(f"{path}: not a checkpoint of TorchRL ({error})") from error
+    if not {"agent", "loss_module"} <= set(components):
+        raise CheckpointError(f"{path}: a TorchRL checkpoint, but not of an agent of torchrl_ocwm ({sorted(components)})")
+    return Checkpoint(agent={}).load(path).values["agent"]
+
+
+def check_same_agent(agent: Agent, path: Path) -> None:
+    """Raise unless a checkpoint is of an agent like this one.
+
+    Raises:
+        CheckpointError: with what differs.
+    """
+    there, here = read_description(path), describe(agent)
+    differences = [
+        f"{part}.{key}: {there[part].get(key)} there, {value} here"
+        for part, values in here.items()
+        for key, value in _plain(values).items()
+        if _plain(there[part]).get(key) != value
+    ]
+    if differences:
+        raise CheckpointError(f"{path}: a checkpoint of another agent ({'; '.join(differences)})")
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as lists, as JSON has them."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def _dataclass(kind: type[T], values: dict[str, Any]) -> T:
+    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    if set(values) != names:
+        odd = sorted(set(values) ^ names)
+        raise CheckpointError(f"the checkpoint is of another release: {kind.__name__} differs in {odd}")
+    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})

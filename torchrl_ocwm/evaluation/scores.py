@@ -1,0 +1,35 @@
+"""How near an entity came to its goal."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def normalized_score(position: Tensor, goal: Tensor) -> Tensor:
+    """exp(−‖p − p_g‖ / ‖p_g‖): 1 at the goal, 1/e for staying at the start (paper, equation 2 and appendix).
+
+    Args:
+        position: ``[..., D]`` metres from the start position.
+        goal: ``[..., D]`` metres from the start position, not the start itself.
+
+    Examples:
+        >>> goal = torch.tensor([0.0, 0.2])
+        >>> normalized_score(torch.stack([goal, torch.zeros(2)]), goal)
+        tensor([1.0000, 0.3679])
+    """
+    distance = torch.linalg.vector_norm(position - goal, dim=-1)
+    return torch.exp(-distance / torch.linalg.vector_norm(goal, dim=-1))
+
+
+def mean_and_error(values: Tensor) -> tuple[float, float | None]:
+    """Mean over seeds and its standard error; no error for a single seed.
+
+    Examples:
+        >>> mean_and_error(torch.tensor([0.7, 0.9]))
+        (0.800..., 0.1000...)
+    """
+    mean = float(values.double().mean())
+    if len(values) < 2:
+        return mean, None
+    return mean, float(values.double().std() / len(values) ** 0.5)

@@ -1,0 +1,133 @@
+"""The networks of a world model, all of them TorchRL's parts, in two styles.
+
+``"dreamer_v3"``: RMS normalisation, SiLU, a block GRU. ``"dreamer_v2"``: no normalisation, ELU, a GRU, the CNN of the
+first Dreamers, which is what the paper used; it takes a third of the operations, and so suits a CPU.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torchrl.modules import (
+    MLP,
+    DreamerV3ImageDecoder,
+    DreamerV3ImageEncoder,
+    DreamerV3MLP,
+    ObsDecoder,
+    ObsEncoder,
+    RSSMPosteriorV3,
+    RSSMPriorV3,
+)
+
+Style = Literal["dreamer_v3", "dreamer_v2"]
+UNIMIX = 0.01
+
+
+def make_mlp(
+    style: Style, in_features: int, out_features: int | None, *, layers: int, units: int, outscale: float = 1.0
+) -> nn.Module:
+    """A multilayer perceptron; several inputs are concatenated.
+
+    Args:
+        style: Which layers.
+        in_features: Features of all inputs together.
+        out_features: Features of the output; ``None``: the last hidden layer.
+        layers: Hidden layers.
+        units: Units of each.
+        outscale: Factor on the initial weights of the last layer; 0 starts with an output of zero.
+
+    Examples:
+        >>> make_mlp("dreamer_v2", 5, 3, layers=1, units=8, outscale=0.0)(torch.ones(2, 4), torch.ones(2, 1))[0]
+        tensor([0., 0., 0.], grad_fn=<SelectBackward0>)
+    """
+    if style == "dreamer_v3":
+        return DreamerV3MLP(in_features, out_features, depth=layers, num_cells=units, outscale=outscale)
+    if out_features is None:
+        return MLP(in_features, units, layers - 1, units, activation_class=nn.ELU, activate_last_layer=True)
+    mlp = MLP(in_features, out_features, layers, units, activation_class=nn.ELU)
+    with torch.no_grad():
+        mlp[-1].weight.mul_(outscale)
+        mlp[-1].bias.zero_()
+    return mlp
+
+
+def make_image_encoder(style: Style, image_size: int, *, depth: int, mults: tuple[int, ...]) -> tuple[nn.Module, int]:
+    """A CNN for images ``[..., 3, H, W]`` uint8, and the number of features that it gives.
+
+    Raises:
+        ValueError: if the image does not go through the CNN.
+    """
+    _check_image_size(style, image_size, mults)
+    if style == "dreamer_v3":
+        encoder = DreamerV3ImageEncoder(3, depth, tuple(mults))
+        return encoder, encoder.output_features((3, image_size, image_size))
+    return nn.Sequential(_ScaledImage(), ObsEncoder(depth, in_channels=3)), depth * 8 * 2 * 2
+
+
+def make_image_decoder(
+    style: Style, in_features: int, image_size: int, *, depth: int, mults: tuple[int, ...]
+) -> nn.Module:
+    """A CNN from state and belief to images ``[..., 3, H, W]`` float32 in [0, 1], unbounded."""
+    _check_image_size(style, image_size, mults)
+    if style == "dreamer_v3":
+        return DreamerV3ImageDecoder(in_features, (3, image_size, image_size), depth, tuple(mults), num_blocks=1)
+    return _ShiftedImage(ObsDecoder(depth, latent_dim=in_features))
+
+
+def make_rssm(
+    style: Style, *, action: int, embedding: int, categoricals: int, classes: int, belief: int, hidden: int, blocks: int
+) -> tuple[RSSMPriorV3, RSSMPosteriorV3]:
+    """Prior and posterior of a discrete RSSM."""
+    v3 = style == "dreamer_v3"
+    prior = RSSMPriorV3(
+        action_shape=(action,),
+        action_dim=action,
+        hidden_dim=hidden,
+        rnn_hidden_dim=belief,
+        num_categoricals=categoricals,
+        num_classes=classes,
+        recurrent_model="block_gru" if v3 else "gru",
+        num_blocks=blocks,
+        unimix=UNIMIX,
+    )
+    posterior = RSSMPosteriorV3(
+        hidden_dim=hidden,
+        rnn_hidden_dim=belief,
+        obs_embed_dim=embedding,
+        num_categoricals=categoricals,
+        num_classes=classes,
+        use_rms_norm=v3,
+        unimix=UNIMIX,
+    )
+    return prior, posterior
+
+
+def _check_image_size(style: Style, image_size: int, mults: tuple[int, ...]) -> None:
+    if style == "dreamer_v2" and image_size != 64:
+        raise ValueError(f"the CNN of style 'dreamer_v2' takes images of 64 x 64 pixels, got {image_size} x {image_size}")
+    factor = 2 ** len(mults)
+    if image_size % factor:
+        raise ValueError(
+            f"a CNN of {len(mults)} stages halves the image {len(mults)} times, which an image of {image_size} x "
+            f"{image_size} pixels does not allow; use a multiple of {factor}"
+        )
+
+
+class _ScaledImage(nn.Module):
+    """uint8 to [−0.5, 0.5]."""
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        return pixels.float() / 255 - 0.5
+
+
+class _ShiftedImage(nn.Module):
+    """[−0.5, 0.5] to [0, 1], what image targets are."""
+
+    def __init__(self, decoder: nn.Module) -> None:
+        super().__init__()
+        self.decoder = decoder
+
+    def forward(self, *latent: Tensor) -> Tensor:
+        return self.decoder(*latent) + 0.5

@@ -1,0 +1,58 @@
+"""How a training run goes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Training:
+    """Settings of a training run.
+
+    Args:
+        updates: Updates of model, actor and critic in all.
+        seed: Seeds weights and sampling.
+        device: Where to train.
+        threads: Threads of PyTorch on a CPU; 0 leaves PyTorch's own choice.
+        log_interval: Updates between two lines of the log, over which losses are averaged. Signals are answered and
+            checkpoints are written at these moments, so the other intervals are rounded up to multiples of it.
+        checkpoint_interval: Updates between two checkpoints.
+        eval_interval: Updates between two evaluations; 0 for none.
+        eval_episodes: Episodes per evaluation, each to one of the task's landmark goals in turn.
+        eval_steps: Steps per episode.
+        video_interval: Updates between two open-loop prediction videos; 0 for none.
+        goals: Goals of the sampled sequences: ``"uniform"`` draws a fresh one for each, ``"stored"`` keeps those of the
+            dataset.
+        compile: Compile the update; ``None`` does so on a GPU only. Takes minutes.
+        cudagraph: Capture the update in a CUDA graph; ``None`` does so on a GPU.
+        mixed_precision: bfloat16 on a GPU.
+        target_rate: Share of the critic that moves into the slow critic at each update.
+        loggers: Where to log beside the CSV files.
+    """
+
+    updates: int = 10_000
+    seed: int = 0
+    device: str = "cpu"
+    threads: int = 0
+    log_interval: int = 50
+    checkpoint_interval: int = 1000
+    eval_interval: int = 1000
+    eval_episodes: int = 5
+    eval_steps: int = 100
+    video_interval: int = 5000
+    goals: Literal["uniform", "stored"] = "uniform"
+    compile: bool | None = None
+    cudagraph: bool | None = None
+    mixed_precision: bool = False
+    target_rate: float = 0.02
+    loggers: tuple[Literal["tensorboard", "wandb"], ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        for name in ("updates", "log_interval", "checkpoint_interval", "eval_episodes", "eval_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.updates % self.log_interval:
+            raise ValueError(f"updates must be a multiple of log_interval, got {self.updates} and {self.log_interval}")
+        if self.goals not in ("uniform", "stored"):
+            raise ValueError(f"goals must be 'uniform' or 'stored', got {self.goals!r}")
