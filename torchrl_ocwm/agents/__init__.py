@@ -6,5 +6,4 @@ from torchrl_ocwm.agents.checkpoint import load_agent
 from torchrl_ocwm.agents.config import AgentConfig, Size
 from torchrl_ocwm.agents.presets import AGENTS, SIZES
 
-__all__ = ["AGENTS", "SIZES", "Agent", "AgentConfig",
-    "Policy", "Size", "build_agent", "load_agent"]
+__all__ = ["AGENTS", "SIZES", "Agent", "AgentConfig", "Policy", "Size", "build_agent", "load_agent"]

@@ -61,7 +61,9 @@ def read_description(path: Path) -> dict[str, Any]:
     except Exception as error:  # whatever a file that is no checkpoint makes a zip or JSON reader raise
         raise CheckpointError(f"{path}: not a checkpoint of TorchRL ({error})") from error
     if not {"agent", "loss_module"} <= set(components):
-        raise CheckpointError(f"{path}: a TorchRL checkpoint, but not of an agent of torchrl_ocwm ({sorted(components)})")
+        raise CheckpointError(
+            f"{path}: a TorchRL checkpoint, but not of an agent of torchrl_ocwm ({sorted(components)})"
+        )
     return Checkpoint(agent={}).load(path).values["agent"]
 
 

@@ -16,9 +16,9 @@ SIZES = {
         model_lr=1e-3, actor_lr=1e-3, value_lr=1e-3, warmup=0,
     ),
     "cpu": Size(
-        style="dreamer_v3", cnn_depth=8, cnn_mults=(1, 2, 4, 4), categoricals=16, classes=16, belief=256, hidden=128, gru_blocks=8,
-        mlp_layers=2, mlp_units=128, batch_size=8, slice_len=16, imagination_horizon=10,
-        model_lr=5e-4, actor_lr=3e-4, value_lr=3e-4, warmup=100,
+        style="dreamer_v3", cnn_depth=8, cnn_mults=(1, 2, 4, 4), categoricals=16, classes=16, belief=128, hidden=128, gru_blocks=8,
+        mlp_layers=2, mlp_units=128, batch_size=16, slice_len=8, imagination_horizon=10,
+        model_lr=1e-3, actor_lr=1e-3, value_lr=1e-3, warmup=100, gamma=0.95,
     ),
     "small": Size(
         style="dreamer_v3", cnn_depth=24, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=16, belief=512, hidden=256, gru_blocks=8,

@@ -46,8 +46,6 @@ class RelabelGoals(Transform):
         if self.goals == "uniform":
             goal = self.workspace.sample(position.shape[:-2]).to(position).unsqueeze(-2).expand_as(position)
             tensordict["next", "goal_position"] = goal.contiguous()
-        distance = torch.linalg.vector_norm(
-            position - tensordict["next", "goal_position"], dim=-1, keepdim=True
-        )
+        distance = torch.linalg.vector_norm(position - tensordict["next", "goal_position"], dim=-1, keepdim=True)
         tensordict["next", "reward"] = -distance  # Eq. 1
         return tensordict

@@ -13,9 +13,9 @@ from gymnasium import spaces
 
 from torchrl_ocwm.envs.camera import Camera
 from torchrl_ocwm.envs.positions import masks_to_positions
+from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.envs.workspace import Workspace
 
-SUCCESS_DISTANCE = 0.05  # metres; paper, figure "reconstructions"
 TARGET_COLOUR = (230, 40, 40)
 
 Observation = dict[str, np.ndarray]

@@ -7,6 +7,9 @@ from typing import Any
 
 from torchrl_ocwm.envs.workspace import Workspace
 
+#: Metres within which an entity counts as at its goal (paper, figure "reconstructions").
+SUCCESS_DISTANCE = 0.05
+
 
 @dataclass(frozen=True)
 class Task:

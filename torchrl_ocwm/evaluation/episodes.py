@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from tqdm import tqdm
 
 from torchrl_ocwm.envs import Task, make_env
-from torchrl_ocwm.envs.positioning import SUCCESS_DISTANCE
+from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.evaluation.scores import normalized_score
 
 Policy = Callable[[TensorDictBase], TensorDictBase]

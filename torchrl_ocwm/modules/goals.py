@@ -23,9 +23,7 @@ class UniformGoals(TensorDictModuleBase):
         torch.Size([5, 2])
     """
 
-    def __init__(
-        self, dim: int, *, goal_key: NestedKey = "goal_units", like: NestedKey = ("latent", "state")
-    ) -> None:
+    def __init__(self, dim: int, *, goal_key: NestedKey = "goal_units", like: NestedKey = ("latent", "state")) -> None:
         super().__init__()
         self.dim = dim
         self.in_keys, self.out_keys = [like], [goal_key]

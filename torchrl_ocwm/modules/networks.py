@@ -106,7 +106,9 @@ def make_rssm(
 
 def _check_image_size(style: Style, image_size: int, mults: tuple[int, ...]) -> None:
     if style == "dreamer_v2" and image_size != 64:
-        raise ValueError(f"the CNN of style 'dreamer_v2' takes images of 64 x 64 pixels, got {image_size} x {image_size}")
+        raise ValueError(
+            f"the CNN of style 'dreamer_v2' takes images of 64 x 64 pixels, got {image_size} x {image_size}"
+        )
     factor = 2 ** len(mults)
     if image_size % factor:
         raise ValueError(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
@@ -76,7 +75,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
         >>> from torchrl_ocwm.agents import build_agent
         >>> from torchrl_ocwm.testing import random_records, reacher_task
         >>> agent = build_agent("dreamer_pcp", reacher_task(), size="debug")
-        >>> losses, records = WorldModelLoss(agent.world_model)(random_records(reacher_task(), 2, 5))
+        >>> losses, records = WorldModelLoss(agent.model.records())(random_records(reacher_task(), 2, 5))
         >>> sorted(losses.keys())
         ['loss_model_continue', 'loss_model_dynamic', 'loss_model_object_position', 'loss_model_pixels', \
 'loss_model_proprio', 'loss_model_representation']
@@ -150,7 +149,9 @@ class WorldModelLoss(DreamerV3ModelLoss):
     def forward(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         missing = [key for key in self.world_model.in_keys if tensordict.get(key, None) is None]
         if missing:
-            raise KeyError(f"the batch lacks {missing}, which the world model reads; it has {sorted(_names(tensordict))}")
+            raise KeyError(
+                f"the batch lacks {missing}, which the world model reads; it has {sorted(_names(tensordict))}"
+            )
         # A new container: the caller's batch stays as it is. The model overwrites the reward that it predicts.
         records = tensordict.select(*tensordict.keys(True, True))
         reward = self._next(records, self.tensor_keys.reward)

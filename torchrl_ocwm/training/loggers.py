@@ -55,7 +55,9 @@ def make_loggers(folder: Path, also: tuple[str, ...] = (), *, name: str = "run")
         if kind not in ("tensorboard", "wandb"):
             raise ValueError(f"unknown logger {kind!r}; there are tensorboard and wandb, beside the CSV files")
         if find_spec(kind) is None:
-            raise ModuleNotFoundError(f"logger {kind!r} is not installed: pip install 'torchrl-ocwm[{kind}]'", name=kind)
+            raise ModuleNotFoundError(
+                f"logger {kind!r} is not installed: pip install 'torchrl-ocwm[{kind}]'", name=kind
+            )
         if kind == "tensorboard":
             from torchrl.record.loggers.tensorboard import TensorboardLogger
 

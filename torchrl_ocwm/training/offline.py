@@ -139,5 +139,7 @@ def _make_folder(folder: Path, training: Training):  # type: ignore[no-untyped-d
         (folder / ".writable").touch()
         (folder / ".writable").unlink()
     except OSError as error:
-        raise CheckpointError(f"{folder}: cannot write here ({error.strerror}); choose another output folder") from error
+        raise CheckpointError(
+            f"{folder}: cannot write here ({error.strerror}); choose another output folder"
+        ) from error
     return make_loggers(folder, training.loggers, name=folder.name)
