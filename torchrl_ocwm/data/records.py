@@ -44,7 +44,7 @@ def episode_to_records(episode: TensorDictBase) -> TensorDictBase:
     steps = episode.select("action", "next")
     steps["is_init"] = torch.zeros(len(episode), 1, dtype=torch.bool)
     steps["next"] = episode["next"].exclude("is_init")
-    first = torch.zeros_like(steps[:1])
+    first = steps[:1].clone().zero_()
     first["is_init"].fill_(True)
     seen = [key for key in steps["next"].keys(True, True) if key in episode.keys(True) and key not in _ENDS]
     first["next"].update_(episode[:1].select(*seen))

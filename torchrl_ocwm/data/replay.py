@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
-from torchrl.data import SliceSampler, ReplayBuffer, TensorStorage
+from torchrl.data import ReplayBuffer, SliceSampler, TensorStorage
 from torchrl.envs import Compose, Transform
 
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -78,7 +78,8 @@ class Camera:
             names = [model.camera(index).name for index in range(model.ncam)]
             raise ValueError(f"the model has no camera {camera!r}; it has {names}")
         self.model, self.height, self.width = model, height, width
-        self._context = self._gl = None
+        self._context: Any = None
+        self._gl: Any = None
         self._set_up(multisampling)
         self._scene = mujoco.MjvScene(model, maxgeom=max_geoms)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows

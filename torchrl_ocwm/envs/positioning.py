@@ -92,7 +92,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         self._plane = None if self.plane is None else torch.tensor(self.plane)
         self._intrinsics = torch.from_numpy(self.camera.intrinsics)
         self._extrinsics = torch.from_numpy(self.camera.extrinsics(self.data))
-        self.observation_space = self._observation_space()
+        self.observation_space = self._observation_space()  # type: ignore[assignment]
         self.action_space = spaces.Box(-1.0, 1.0, self._action_shape(), np.float32)
 
     # What a suite fills in.
@@ -195,8 +195,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         mujoco.mj_copyData(self._scratch, self.model, self.data)
         self._teleport(self._scratch, goal)
         mujoco.mj_forward(self.model, self._scratch)
-        observation = self._observe(self._scratch, goal=goal)
-        return observation
+        return self._observe(self._scratch, goal=goal)
 
     def _observation_space(self) -> spaces.Dict:
         size, objects, dim = self.image_size, len(self.objects), self.workspace.dim
@@ -211,7 +210,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
                 "proprio": real(*self._proprio(self.data).shape),
                 "object_position": real(objects, dim),
                 "object_visible": spaces.Box(0, 1, (objects,), np.bool_),
-                "goal_position": spaces.Box(np.float32(self.workspace.low), np.float32(self.workspace.high)),
+                "goal_position": spaces.Box(*np.array([self.workspace.low, self.workspace.high], np.float32)),
                 "object_position_true": real(objects, dim),
             }
         )

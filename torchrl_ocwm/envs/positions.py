@@ -240,7 +240,7 @@ class MaskToPosition(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._write(next_tensordict, *self._estimate(next_tensordict), tensordict.get(self.out_keys[0]))
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
         position, visible = self._estimate(tensordict_reset)
         return self._write(tensordict_reset, position, visible, torch.zeros_like(position))
 

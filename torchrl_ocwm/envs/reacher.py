@@ -18,6 +18,7 @@ except ModuleNotFoundError as error:
 
 _LINK = 0.12  # metres, both links
 _WRIST_LIMIT = np.deg2rad(160)
+_REACH = (2 * _LINK * float(np.cos(_WRIST_LIMIT / 2)), 2 * _LINK)
 
 
 class Reacher(PositioningEnv):
@@ -42,7 +43,7 @@ class Reacher(PositioningEnv):
     workspace = Workspace(
         low=(-0.24, -0.24),
         high=(0.24, 0.24),
-        reach=(2 * _LINK * float(np.cos(_WRIST_LIMIT / 2)), 2 * _LINK),
+        reach=_REACH,
         landmarks=(
             (0.24, 0.0),
             (-0.24, 0.0),
@@ -88,7 +89,7 @@ class Reacher(PositioningEnv):
 
     def _teleport(self, data: mujoco.MjData, position: np.ndarray) -> None:
         # Two equal links: the elbow angle follows from the distance, the shoulder from the direction.
-        distance = float(np.clip(np.linalg.norm(position), *self.workspace.reach))
+        distance = float(np.clip(np.linalg.norm(position), *_REACH))
         wrist = 2 * np.arccos(np.clip(distance / (2 * _LINK), 0, 1))
         data.qpos[:] = np.arctan2(position[1], position[0]) - wrist / 2, wrist
         data.qvel[:] = 0

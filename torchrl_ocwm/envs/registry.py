@@ -81,14 +81,16 @@ def make_task(name: str, **options: Any) -> Task:
     import torchrl_ocwm.envs  # noqa: F401  (registers the ids)
 
     with closing(gymnasium.make(_find(name).id, **options)) as env:
-        space = env.observation_space
+        space: Any = env.observation_space
+        task: Any = env.unwrapped
         return Task(
             name=name,
             image_size=space["pixels"].shape[-1],
-            objects=tuple(env.unwrapped.objects),
+            objects=tuple(task.objects),
             proprio=space["proprio"].shape[0],
-            action=env.action_space.shape[0],
-            workspace=env.unwrapped.workspace,
+            action=task.action_space.shape[0],
+            workspace=task.workspace,
+            options={key: value for key, value in options.items() if key != "horizon"},
         )
 
 

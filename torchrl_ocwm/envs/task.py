@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from torchrl_ocwm.envs.workspace import Workspace
@@ -22,6 +22,7 @@ class Task:
         proprio: Number of proprioceptive values P.
         action: Number of actions A.
         workspace: Where goals are.
+        options: What else :func:`~torchrl_ocwm.envs.make_env` needs to make the environment again, beside the horizon.
 
     Examples:
         >>> task = Task("reacher", 64, ("finger",), 5, 2, Workspace(low=(-0.24, -0.24), high=(0.24, 0.24)))
@@ -35,6 +36,7 @@ class Task:
     proprio: int
     action: int
     workspace: Workspace
+    options: dict[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """A mapping that fits in JSON."""
@@ -43,7 +45,7 @@ class Task:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Task:
         """Read what :meth:`to_dict` wrote, also after a trip through JSON."""
-        workspace = {
+        workspace: dict[str, Any] = {
             name: value if value is None else tuple(tuple(v) if isinstance(v, list) else v for v in value)
             for name, value in values["workspace"].items()
         }

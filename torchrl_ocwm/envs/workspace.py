@@ -39,7 +39,7 @@ class Workspace:
     landmarks: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        if len(self.low) != len(self.high) or not all(a < b for a, b in zip(self.low, self.high)):
+        if len(self.low) != len(self.high) or not all(a < b for a, b in zip(self.low, self.high, strict=True)):
             raise ValueError(f"a workspace needs low < high on every axis, got low={self.low} and high={self.high}")
 
     @property

@@ -1,0 +1,20 @@
+"""How well it did: goals in a grid, scores, reconstruction errors, reports, pictures and videos.
+
+``plots`` and ``videos`` need the extra ``recipes``, so they are imported from their modules.
+"""
+
+from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, measure
+from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation
+from torchrl_ocwm.evaluation.reconstruction import ReconstructionError
+from torchrl_ocwm.evaluation.report import Report
+from torchrl_ocwm.evaluation.scores import mean_and_error, normalized_score
+
+__all__ = [
+    "EvaluationEnvs",
+    "LandmarkEvaluation",
+    "ReconstructionError",
+    "Report",
+    "mean_and_error",
+    "measure",
+    "normalized_score",
+]

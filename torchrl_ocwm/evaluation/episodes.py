@@ -29,15 +29,12 @@ class EvaluationEnvs:
         episode_steps: Steps per episode.
         workers: Processes; 0 steps all environments in this process.
         envs: Environments per process.
-        options: Passed to the environments.
 
     Close it, or use it in a ``with`` block.
     """
 
-    def __init__(
-        self, task: Task, *, episode_steps: int, workers: int = 2, envs: int = 10, options: dict[str, Any] | None = None
-    ) -> None:
-        make = partial(make_env, task.name, horizon=episode_steps, **(options or {}))
+    def __init__(self, task: Task, *, episode_steps: int, workers: int = 2, envs: int = 10) -> None:
+        make = partial(make_env, task.name, horizon=episode_steps, **task.options)
         serial = partial(SerialEnv, envs, make)
         self.task, self.episode_steps, self.shape = task, episode_steps, (max(workers, 1), envs)
         self.env: EnvBase = ParallelEnv(workers, serial, mp_start_method="spawn") if workers else SerialEnv(1, serial)
@@ -76,7 +73,7 @@ class EvaluationEnvs:
                 full = torch.cat([chunk, chunk[-1:].expand(size - len(chunk), -1)])
                 batches.append(self._episodes(policy, full, keep, inspect)[: len(chunk)])
                 bar.update(len(chunk))
-        return torch.cat(batches)
+        return TensorDict.cat(batches)
 
     @torch.no_grad()
     def _episodes(
@@ -98,7 +95,7 @@ class EvaluationEnvs:
                     kept.update(inspect(tensordict))
                 steps.append(kept.reshape(-1))
                 tensordict = step_mdp(tensordict, keep_other=True, exclude_action=False)
-        episodes = torch.stack(steps, 1)
+        episodes = TensorDict.stack(steps, 1)
         return episodes.set("goal_position", goals.unsqueeze(1).expand(-1, self.episode_steps, -1).clone())
 
     def close(self) -> None:

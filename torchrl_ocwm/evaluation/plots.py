@@ -7,13 +7,12 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-import torch
 from torch import Tensor
 
 from torchrl_ocwm.envs.workspace import Workspace
 
 matplotlib.use("Agg")
-from matplotlib import pyplot as plt  # noqa: E402
+from matplotlib import pyplot as plt
 
 
 def heatmap(path: str | Path, scores: dict[str, Tensor], workspace: Workspace, *, title: str = "") -> None:
@@ -26,7 +25,7 @@ def heatmap(path: str | Path, scores: dict[str, Tensor], workspace: Workspace, *
         title: Written above.
     """
     figure, axes = plt.subplots(1, len(scores), figsize=(3.2 * len(scores) + 0.8, 3.6), squeeze=False)
-    for axis, (name, values) in zip(axes[0], scores.items()):
+    for axis, (name, values) in zip(axes[0], scores.items(), strict=True):
         size = round(len(values) ** 0.5)
         edges = 100 * workspace.grid_edges(size)
         x, y = edges[..., 0].numpy(), edges[..., -1].numpy()
@@ -50,10 +49,10 @@ def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict
         metrics: Logged name → axis label, one panel each.
     """
     figure, axes = plt.subplots(1, len(metrics), figsize=(4.2 * len(metrics), 3.2), squeeze=False)
-    for axis, (metric, label) in zip(axes[0], metrics.items()):
+    for axis, (metric, label) in zip(axes[0], metrics.items(), strict=True):
         for name, folders in runs.items():
-            curves = [read_scalar(folder, metric) for folder in folders]
-            curves = [curve for curve in curves if curve is not None]
+            found = [read_scalar(folder, metric) for folder in folders]
+            curves = [curve for curve in found if curve is not None]
             if not curves:
                 continue
             length = min(len(steps) for steps, _ in curves)

@@ -96,5 +96,5 @@ class ImaginationEnv(DreamerEnv):
             [*step.batch_size, max_steps],
         )
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:  # noqa: ARG002
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:  # noqa: ARG002
         return self.state_spec.rand() if tensordict is None else tensordict.clone()

@@ -31,7 +31,7 @@ class WorkspaceUnits(nn.Module):
 
     def __init__(self, low: tuple[float, ...], high: tuple[float, ...]) -> None:
         super().__init__()
-        if len(low) != len(high) or not all(a < b for a, b in zip(low, high)):
+        if len(low) != len(high) or not all(a < b for a, b in zip(low, high, strict=True)):
             raise ValueError(f"a workspace needs low < high on every axis, got low={low} and high={high}")
         self.register_buffer("low", torch.tensor(low))
         self.register_buffer("high", torch.tensor(high))

@@ -145,7 +145,7 @@ class FlatWorldModel(nn.Module):
         return modules
 
     def vectors(self, *at: str) -> list[TensorDictModule]:
-        """Predictions of the observed vectors from the latent at a place: ``reco_proprio``, ``reco_object_units``, …"""
+        """Predictions of the observed vectors from the latent at a place: ``reco_proprio``, …, ``reco_goal_units``."""
         return [
             TensorDictModule(decoder, _latent(at), [_key(at, f"reco_{_KEYS[name]}")])
             for name, decoder in self.vector_decoders.items()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -161,7 +162,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
         losses.update(self._head_losses(records, reward))
         return TensorDict(losses), records
 
-    def _next(self, records: TensorDictBase, key: NestedKey) -> Tensor | None:
+    def _next(self, records: TensorDictBase, key: NestedKey) -> Any:
         return records.get(unravel_key(("next", key)), None)
 
     def _kl_losses(self, records: TensorDictBase) -> dict[str, Tensor]:
@@ -186,7 +187,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
                 losses[f"loss_model_{name}"] = getattr(self, f"lambda_{name}") * error(prediction, target)
         return losses
 
-    def _head_losses(self, records: TensorDictBase, reward: Tensor | None) -> dict[str, Tensor]:
+    def _head_losses(self, records: TensorDictBase, reward: Any) -> dict[str, Tensor]:
         losses = {}
         logits = self._next(records, self.tensor_keys.reward_logits)
         if logits is not None:

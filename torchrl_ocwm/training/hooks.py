@@ -98,8 +98,8 @@ def stop_when_not_finite(updates: int, losses: TensorDictBase) -> None:
     bad = [name for name, value in losses.items() if name.startswith("loss_") and not value.isfinite().all()]
     if bad:
         raise FloatingPointError(
-            f"after {updates} updates {', '.join(sorted(bad))} is not finite; check the data and the learning rates. The "
-            "last checkpoint is still good."
+            f"after {updates} updates {', '.join(sorted(bad))} is not finite; check the data and the learning rates. "
+            "The last checkpoint is still good."
         )
 
 
@@ -120,5 +120,5 @@ def stop_on_signals(trainer: Trainer) -> Iterator[None]:
     try:
         yield
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        for taken, handler in handlers.items():
+            signal.signal(taken, handler)

@@ -32,10 +32,13 @@ class Loggers:
         for logger in self.loggers:
             logger.log_scalar(name, float(value), step=step)
 
-    def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
-        """Log a video ``[1, T, 3, H, W]`` uint8, but not to CSV."""
-        for logger in self.loggers[1:]:
-            logger.log_video(name, video, step=step, **kwargs)
+    def log_video(self, name: str, file: Path, step: int | None = None) -> None:
+        """Show a video file in Weights & Biases; the other loggers do not take files."""
+        for logger in self.loggers:
+            if type(logger).__name__ == "WandbLogger":
+                import wandb
+
+                logger.experiment.log({name: wandb.Video(str(file))}, step=step)
 
 
 def make_loggers(folder: Path, also: tuple[str, ...] = (), *, name: str = "run") -> Loggers:

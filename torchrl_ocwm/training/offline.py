@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState
 from torchrl.trainers import Trainer
 
@@ -15,14 +16,12 @@ from torchrl_ocwm.agents.checkpoint import check_same_agent, describe
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals, make_replay_buffer
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.training.hooks import Every, ProgressBar, UpdateClock, stop_on_signals, stop_when_not_finite
-from torchrl_ocwm.training.loggers import make_loggers
+from torchrl_ocwm.training.loggers import Loggers, make_loggers
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_stepper
 
 CHECKPOINT = "checkpoint.zip"
 _SHOWN = ("loss_model_pixels", "loss_model_object_position", "loss_actor", "loss_value")
-
-Look = Callable[[int], dict[str, float] | None]
 
 
 def train_offline(
@@ -31,8 +30,8 @@ def train_offline(
     folder: str | Path,
     training: Training,
     *,
-    evaluate: Look | None = None,
-    film: Callable[[int, TensorDictBase], None] | None = None,
+    evaluate: Callable[[int], dict[str, float]] | None = None,
+    film: Callable[[], Tensor] | None = None,
     progress: bool = True,
 ) -> Path:
     """Train an agent on a dataset; continue from the folder's checkpoint if it has one.
@@ -46,7 +45,7 @@ def train_offline(
         folder: Where checkpoint and logs go.
         training: The settings.
         evaluate: Called every ``eval_interval`` updates with their number; returns scores to log.
-        film: Called every ``video_interval`` updates with their number and a batch of records.
+        film: Called every ``video_interval`` updates; returns a video ``[T, 3, H, W]`` uint8 for the folder ``videos``.
         progress: Show a progress bar.
 
     Returns:
@@ -99,7 +98,7 @@ def train_offline(
     if evaluate is not None:
         Every(trainer, training.eval_interval, evaluate)
     if film is not None:
-        Every(trainer, training.video_interval, lambda updates: film(updates, sample()))
+        Every(trainer, training.video_interval, lambda updates: _show(film(), updates, folder, loggers))
     if any(stepper.resolve(torch.device(training.device))):
         stepper.warmup(sample())
     if file.exists():
@@ -127,13 +126,21 @@ class RunCheckpoint(Checkpoint):
             raise CheckpointError(f"cannot write the checkpoint {path} ({reason}); {kept}") from error
 
 
+def _show(video: Tensor, updates: int, folder: Path, loggers: Loggers) -> None:
+    from torchrl_ocwm.evaluation.videos import write_video
+
+    file = folder / "videos" / f"open_loop_{updates:07d}.mp4"
+    write_video(file, video)
+    loggers.log_video("open_loop", file, step=updates)
+
+
 def _check_task(agent: Agent, dataset: EpisodeDataset) -> None:
     there = Task.from_dict(dataset.metadata["task"])
     if there != agent.task:
         raise DatasetError(f"{dataset.path}: holds {there}, but the agent was built for {agent.task}")
 
 
-def _make_folder(folder: Path, training: Training):  # type: ignore[no-untyped-def]
+def _make_folder(folder: Path, training: Training) -> Loggers:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / ".writable").touch()

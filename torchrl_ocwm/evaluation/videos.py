@@ -1,0 +1,148 @@
+"""Videos of real and imagined rollouts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_ocwm.agents.agent import Agent
+from torchrl_ocwm.data.dataset import EpisodeDataset
+from torchrl_ocwm.modules import FlatWorldModel
+
+
+def write_video(path: str | Path, frames: Tensor, *, fps: int = 15, scale: int = 3) -> None:
+    """Write an mp4 video.
+
+    Args:
+        path: File to write.
+        frames: ``[T, 3, H, W]`` uint8.
+        fps: Frames per second.
+        scale: Size of a pixel in the video.
+    """
+    images = frames.permute(0, 2, 3, 1).numpy().repeat(scale, 1).repeat(scale, 2)
+    # H.264 takes even sizes only.
+    images = np.pad(images, [(0, 0), (0, images.shape[1] % 2), (0, images.shape[2] % 2), (0, 0)])
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    imageio.imwrite(path, images, fps=fps, codec="libx264", macro_block_size=1, plugin="FFMPEG")
+
+
+def tile(rows: list[Tensor], gap: int = 2) -> Tensor:
+    """Lay videos out, one kind per row and one example per column.
+
+    Args:
+        rows: One ``[N, T, 3, H, W]`` uint8 per row.
+        gap: Pixels between them.
+
+    Returns:
+        ``[T, 3, *, *]`` uint8.
+
+    Examples:
+        >>> tile([torch.zeros(2, 5, 3, 4, 4, dtype=torch.uint8)] * 3, gap=0).shape
+        torch.Size([5, 3, 12, 8])
+    """
+    padded = [torch.nn.functional.pad(row, (0, gap, 0, gap), value=255) for row in rows]
+    return torch.cat([torch.cat(list(row), -1) for row in padded], -2)
+
+
+@torch.no_grad()
+def open_loop_prediction(model: FlatWorldModel, records: TensorDictBase, context: int) -> Tensor:
+    """Images that a world model predicts from the first frames and the actions alone.
+
+    Args:
+        model: The world model.
+        records: ``[N, T]`` records, the first of each sequence with ``is_init`` set.
+        context: Frames that it sees; the others are predicted.
+
+    Returns:
+        ``[N, T, 3, H, W]`` uint8: reconstructions of the context, then predictions.
+    """
+    seen = model.records()(records[:, :context].clone())["next"]
+    step = TensorDict({"latent": seen[:, -1].select("state", "belief")}, [len(records)])
+    transition = model.transition()
+    images = list(seen["reco_pixels"].unbind(1))
+    for t in range(context, records.shape[1]):
+        step = transition(step.select("latent").set("action", records["action"][:, t]))
+        images.append(decode_pixels(model, step["latent"]))
+    return to_uint8(torch.stack(images, 1))
+
+
+def decode_pixels(model: FlatWorldModel, latent: TensorDictBase) -> Tensor:
+    """Images ``[..., 3, H, W]`` float32 in [0, 1], unbounded, of latents ``{state, belief}``."""
+    return model.image_decoder(latent["state"], latent["belief"])
+
+
+def to_uint8(images: Tensor) -> Tensor:
+    """Images in [0, 1] as uint8."""
+    return (images.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+class OpenLoopFilm:
+    """Open-loop predictions on a few fixed sequences of a dataset: truth, model and error, one below the other.
+
+    Args:
+        agent: The agent in training.
+        dataset: Where the sequences are from.
+        sequences: How many.
+        length: Frames of each, at most the shortest episode.
+        context: Frames that the model sees.
+
+    Called without arguments; returns ``[T, 3, H, W]`` uint8.
+    """
+
+    def __init__(
+        self, agent: Agent, dataset: EpisodeDataset, *, sequences: int = 6, length: int = 50, context: int = 5
+    ) -> None:
+        self.agent, self.context = agent, context
+        lengths = torch.tensor(dataset.episode_lengths)
+        length = min(length, int(lengths.min()))
+        episodes = torch.linspace(0, len(lengths) - 1, sequences).long()
+        starts = lengths.cumsum(0)[episodes] - lengths[episodes]
+        self.records = dataset.records[starts[:, None] + torch.arange(length)].contiguous()
+
+    def __call__(self) -> Tensor:
+        device = next(self.agent.parameters()).device
+        predicted = open_loop_prediction(self.agent.model, self.records.to(device), self.context).cpu()
+        truth = self.records["next", "pixels"]
+        error = (predicted.int() - truth.int()).abs().to(torch.uint8)
+        return tile([truth, predicted, error])
+
+
+@torch.no_grad()
+def imagined_rollout(agent: Agent, latent: TensorDictBase, steps: int) -> Tensor:
+    """What an agent imagines from a latent when it acts on its own predictions.
+
+    Args:
+        agent: The agent.
+        latent: ``[N]`` with state, belief and, if the agent is conditioned on one, goal.
+        steps: Steps to imagine.
+
+    Returns:
+        ``[N, steps, 3, H, W]`` uint8.
+    """
+    latent = latent.select("state", "belief", "goal", strict=False)
+    start = TensorDict({"latent": latent}, latent.batch_size)
+    actor: Callable[[TensorDictBase], TensorDictBase] = agent.actor
+    rollout = agent.imagination.rollout(steps, actor, auto_reset=False, tensordict=start, break_when_any_done=False)
+    return to_uint8(decode_pixels(agent.model, rollout["latent"]))
+
+
+def mark(pixels: Tensor, points: Tensor) -> Tensor:
+    """Draw a cross at a point of each video.
+
+    Args:
+        pixels: ``[N, T, 3, H, W]`` uint8.
+        points: ``[N, 2]`` pixels, (column, row).
+    """
+    marked = pixels.clone()
+    height, width = pixels.shape[-2:]
+    for video, (column, row) in zip(marked, points.round().long().tolist(), strict=True):
+        for x, y in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+            if 0 <= row + y < height and 0 <= column + x < width:
+                video[:, :, row + y, column + x] = torch.tensor([230, 40, 40], dtype=torch.uint8)
+    return marked
