@@ -3,7 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_type_hints
+
+
+def check_choices(config: Any) -> None:
+    """Check the fields of a dataclass that are typed as choices.
+
+    Raises:
+        ValueError: for a value that is not one of its field's ``Literal``, with those that are.
+
+    Examples:
+        >>> AgentConfig(goal="latent")
+        Traceback (most recent call last):
+        ValueError: goal must be one of 'none', 'position', got 'latent'
+    """
+    for name, hint in get_type_hints(type(config)).items():
+        value = getattr(config, name)
+        many = getattr(hint, "__origin__", None) is tuple
+        choices = get_args(get_args(hint)[0] if many else hint)
+        if not choices or not all(isinstance(choice, str) for choice in choices):
+            continue
+        for one in value if many else (value,):
+            if one not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {one!r}")
 
 
 @dataclass(frozen=True)
@@ -30,6 +52,9 @@ class AgentConfig:
     lambda_proprio: float = 1.0
     lambda_object_position: float = 200.0
     lambda_goal_position: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_choices(self)
 
 
 @dataclass(frozen=True)
@@ -77,6 +102,15 @@ class Size:
     warmup: int
     gamma: float = 0.99
     entropy_bonus: float = 3e-4
+
+    def __post_init__(self) -> None:
+        check_choices(self)
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, int) and value < (field.name != "warmup"):
+                raise ValueError(f"{field.name} must be positive, got {value}")
+        if self.belief % self.gru_blocks:
+            raise ValueError(f"belief must be a multiple of gru_blocks, got {self.belief} and {self.gru_blocks}")
 
     def architecture(self) -> dict[str, Any]:
         """The part that shapes the world model's networks."""

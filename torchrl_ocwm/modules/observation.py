@@ -25,7 +25,7 @@ class ObservationEncoder(nn.Module):
     ``[..., features]`` float32.
 
     Raises:
-        ValueError: if the image cannot be halved by every stage.
+        ValueError: if the image cannot be halved by every stage; when called, for inputs of other shapes.
 
     Examples:
         >>> encoder = ObservationEncoder(16, 5, cnn_depth=4, cnn_mults=(1, 2), mlp_layers=1, mlp_units=8)
@@ -47,13 +47,23 @@ class ObservationEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.cnn, self.features = make_image_encoder(style, image_size, depth=cnn_depth, mults=cnn_mults)
+        self.image_size, self.vector_features = image_size, vector_features
         self.mlp = None
         if vector_features:
             self.mlp = make_mlp(style, vector_features, None, layers=mlp_layers, units=mlp_units)
             self.features += mlp_units
 
     def forward(self, pixels: Tensor, *vectors: Tensor) -> Tensor:
+        self._check(pixels, vectors)
         image = self.cnn(pixels)
         if self.mlp is None:
             return image
         return torch.cat([image, self.mlp(symlog(torch.cat(vectors, -1)))], -1)
+
+    def _check(self, pixels: Tensor, vectors: tuple[Tensor, ...]) -> None:
+        expected = (3, self.image_size, self.image_size)
+        if pixels.shape[-3:] != expected:
+            raise ValueError(f"this model takes images of shape (..., *{expected}), got {tuple(pixels.shape)}")
+        if sum(vector.shape[-1] for vector in vectors) != self.vector_features:
+            shapes = [tuple(vector.shape) for vector in vectors]
+            raise ValueError(f"this model takes vectors of {self.vector_features} values in all, got shapes {shapes}")

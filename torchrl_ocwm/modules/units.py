@@ -18,6 +18,9 @@ class WorkspaceUnits(nn.Module):
 
     Calling it turns ``[..., D]`` metres into units, float32.
 
+    Raises:
+        ValueError: unless low < high on every axis; when called, for positions of another dimension.
+
     Examples:
         >>> units = WorkspaceUnits((-0.2, 0.0), (0.2, 0.4))
         >>> units(torch.tensor([0.1, 0.4]))
@@ -47,6 +50,8 @@ class WorkspaceUnits(nn.Module):
         return (self.high - self.low) / 2
 
     def forward(self, metres: Tensor) -> Tensor:
+        if metres.shape[-1] != self.dim:
+            raise ValueError(f"positions have {self.dim} coordinates here, got shape {tuple(metres.shape)}")
         return (metres - (self.low + self.high) / 2) / self.metres_per_unit
 
     def to_metres(self, units: Tensor) -> Tensor:

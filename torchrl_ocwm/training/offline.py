@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState
-from torchrl.trainers import Trainer
+from torchrl.trainers import OptimizationStepper, Trainer
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.checkpoint import check_same_agent, describe
@@ -64,34 +64,11 @@ def train_offline(
     if training.threads:
         torch.set_num_threads(training.threads)
     torch.manual_seed(training.seed)
-    size = agent.size
-    replay = make_replay_buffer(
-        dataset,
-        batch_size=size.batch_size,
-        slice_len=size.slice_len,
-        transform=RelabelGoals(agent.task.workspace, goals=training.goals),
-    )
     agent.to(training.device).train()
-
-    def sample(batch: TensorDictBase | None = None) -> TensorDictBase:  # noqa: ARG001
-        return replay.sample().to(training.device)
-
-    stepper = make_stepper(agent, training)
     loggers = _make_folder(folder, training)
-    trainer = Trainer(
-        collector=UpdateClock(training.log_interval),
-        total_frames=training.updates,
-        frame_skip=1,
-        optim_steps_per_batch=training.log_interval,
-        loss_module=agent.loss,
-        optimization_stepper=stepper,
-        logger=loggers,
-        log_interval=0,
-        progress_bar=False,
-        save_trainer_interval=training.checkpoint_interval - 1,
-        save_trainer_file=file,
-        checkpoint=RunCheckpoint(format="archive", agent=describe(agent), rng=GlobalRNGState()),
-    )
+    sample = _make_sampler(agent, dataset, training)
+    stepper = make_stepper(agent, training)
+    trainer = _make_trainer(agent, training, stepper, loggers, file)
     trainer.register_op("process_optim_batch", sample)
     trainer.register_op("post_optim_complete_log", stop_when_not_finite)
     ProgressBar(trainer, _SHOWN, disable=not progress)
@@ -107,6 +84,39 @@ def train_offline(
         with stop_on_signals(trainer):
             trainer.train()
     return file
+
+
+def _make_sampler(agent: Agent, dataset: EpisodeDataset, training: Training) -> Callable[..., TensorDictBase]:
+    replay = make_replay_buffer(
+        dataset,
+        batch_size=agent.size.batch_size,
+        slice_len=agent.size.slice_len,
+        transform=RelabelGoals(agent.task.workspace, goals=training.goals),
+    )
+
+    def sample(batch: TensorDictBase | None = None) -> TensorDictBase:  # noqa: ARG001
+        return replay.sample().to(training.device)
+
+    return sample
+
+
+def _make_trainer(
+    agent: Agent, training: Training, stepper: OptimizationStepper, loggers: Loggers, file: Path
+) -> Trainer:
+    return Trainer(
+        collector=UpdateClock(training.log_interval),
+        total_frames=training.updates,
+        frame_skip=1,
+        optim_steps_per_batch=training.log_interval,
+        loss_module=agent.loss,
+        optimization_stepper=stepper,
+        logger=loggers,
+        log_interval=0,
+        progress_bar=False,
+        save_trainer_interval=training.checkpoint_interval - 1,
+        save_trainer_file=file,
+        checkpoint=RunCheckpoint(format="archive", agent=describe(agent), rng=GlobalRNGState()),
+    )
 
 
 class RunCheckpoint(Checkpoint):

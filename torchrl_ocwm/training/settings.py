@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from torchrl_ocwm.agents.config import check_choices
+
 
 @dataclass(frozen=True)
 class Training:
@@ -19,7 +21,7 @@ class Training:
             checkpoints are written at these moments, so the other intervals are rounded up to multiples of it.
         checkpoint_interval: Updates between two checkpoints.
         eval_interval: Updates between two evaluations; 0 for none.
-        eval_episodes: Episodes per evaluation, each to one of the task's landmark goals in turn.
+        eval_episodes: Episodes per evaluation, one to each of the task's first landmark goals.
         eval_steps: Steps per episode.
         video_interval: Updates between two open-loop prediction videos; 0 for none.
         goals: Goals of the sampled sequences: ``"uniform"`` draws a fresh one for each, ``"stored"`` keeps those of the
@@ -36,11 +38,11 @@ class Training:
     device: str = "cpu"
     threads: int = 0
     log_interval: int = 50
-    checkpoint_interval: int = 1000
-    eval_interval: int = 1000
-    eval_episodes: int = 5
+    checkpoint_interval: int = 500
+    eval_interval: int = 500
+    eval_episodes: int = 10
     eval_steps: int = 100
-    video_interval: int = 5000
+    video_interval: int = 2000
     goals: Literal["uniform", "stored"] = "uniform"
     compile: bool | None = None
     cudagraph: bool | None = None
@@ -54,5 +56,4 @@ class Training:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.updates % self.log_interval:
             raise ValueError(f"updates must be a multiple of log_interval, got {self.updates} and {self.log_interval}")
-        if self.goals not in ("uniform", "stored"):
-            raise ValueError(f"goals must be 'uniform' or 'stored', got {self.goals!r}")
+        check_choices(self)
