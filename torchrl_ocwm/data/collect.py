@@ -82,8 +82,10 @@ def collect(
         return dataset
     done = dataset.num_steps if dataset is not None else 0
     torch.manual_seed(seed + done)
+    # The collector resets its environments before it can be seeded, so they bring their first seeds along.
+    first_seeds = torch.randint(2**31, (workers,)).tolist()
     collector = MultiSyncCollector(
-        [partial(make_env, environment, **options)] * workers,
+        [partial(make_env, environment, seed=first_seed, **options) for first_seed in first_seeds],
         policy or SmoothRandomPolicy(task.action),
         frames_per_batch=workers * 100,
         total_frames=-1,
@@ -113,7 +115,7 @@ def collect(
 def _open_if_there(path: Path, source: dict[str, Any]) -> EpisodeDataset | None:
     if not (path / "dataset.json").exists():
         return None
-    dataset = EpisodeDataset.open(path)
+    dataset = EpisodeDataset.open(path, allow_empty=True)  # it may have been killed before the first episode
     there = {key: dataset.metadata.get(key) for key in source}
     if there != json.loads(json.dumps(source)):
         raise DatasetError(

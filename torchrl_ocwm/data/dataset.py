@@ -81,14 +81,22 @@ class EpisodeDataset:
         return dataset
 
     @classmethod
-    def open(cls, path: str | Path) -> EpisodeDataset:
+    def open(cls, path: str | Path, *, allow_empty: bool = False) -> EpisodeDataset:
         """Open a dataset, after checking that its files are whole and belong together.
+
+        Args:
+            path: Its folder.
+            allow_empty: Also open one in which no episode has been stored yet, to add some.
 
         Raises:
             DatasetError: if the folder holds no dataset, a foreign, truncated, empty or corrupt one.
         """
         path = Path(path)
         index = _read_index(path)
+        if not index["records"]:
+            if not allow_empty:
+                raise DatasetError(f"{path / _INDEX}: no episode has been stored yet; collect some first")
+            return cls(path, index)
         for name, (shape, dtype) in index["keys"].items():
             _check_size(path / _FRAMES / f"{name}.memmap", torch.Size([index["records"], *shape]), _dtype(dtype))
         dataset = cls(path, index)
@@ -186,6 +194,8 @@ class EpisodeDataset:
         self._index = index
 
     def _check_new(self, records: TensorDictBase) -> None:
+        if not len(records):
+            raise DatasetError("an episode without records cannot be stored")
         keys = _describe(records[0])
         if keys != self._index["keys"]:
             expected = self._index["keys"]
@@ -238,6 +248,8 @@ def _read_index(path: Path) -> dict[str, Any]:
         index = json.loads(file.read_text())
     except FileNotFoundError:
         raise DatasetError(f"{file}: no such file; {path} holds no dataset of torchrl_ocwm") from None
+    except OSError as error:
+        raise DatasetError(f"{file}: cannot be read ({error.strerror or error})") from error
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise DatasetError(f"{file}: not JSON ({error}); the dataset is corrupt") from error
     if not isinstance(index, dict) or index.get("format") != FORMAT:
@@ -247,8 +259,6 @@ def _read_index(path: Path) -> dict[str, Any]:
     missing = {"records", "episode_lengths", "keys"} - set(index)
     if missing:
         raise DatasetError(f"{file}: lacks {sorted(missing)}; the dataset is corrupt")
-    if not index["records"]:
-        raise DatasetError(f"{file}: no episode has been stored yet; collect some first")
     return index
 
 

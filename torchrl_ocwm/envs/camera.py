@@ -169,6 +169,7 @@ class Camera:
     def close(self) -> None:
         """Free the OpenGL context. Closing twice does nothing."""
         if self._context is not None:
+            self._gl.make_current()  # it would free the buffers of whichever camera rendered last
             self._context.free()
         if self._gl is not None:
             self._gl.free()

@@ -141,9 +141,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         low, high = np.array(self.workspace.low), np.array(self.workspace.high)
         goal = self.np_random.uniform(low, high)  # drawn also when given, so that a goal does not move the start
         if options.get("goal_position") is not None:
-            goal = self.workspace.check(options["goal_position"]).numpy()
-        if goal.shape != low.shape:
-            raise ValueError(f"one goal position of shape {low.shape} per episode, got shape {goal.shape}")
+            goal = self._check_goal(options["goal_position"])
         self._goal = goal.astype(np.float32)
         self._reset_simulator()
         self._steps = 0
@@ -189,13 +187,22 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         Returns:
             An observation with the keys of the environment, ``goal_position`` set to the goal.
         """
-        goal = self.workspace.check(goal_position).numpy()
+        goal = self._check_goal(goal_position)
         if self._scratch is None:
             self._scratch = mujoco.MjData(self.model)
-        mujoco.mj_copyData(self._scratch, self.model, self.data)
+        full = mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mujoco.mj_stateSize(self.model, full))
+        mujoco.mj_getState(self.model, self.data, state, full)
+        mujoco.mj_setState(self.model, self._scratch, state, full)
         self._teleport(self._scratch, goal)
         mujoco.mj_forward(self.model, self._scratch)
         return self._observe(self._scratch, goal=goal)
+
+    def _check_goal(self, goal_position: Any) -> np.ndarray:
+        goal = self.workspace.check(goal_position)
+        if goal.shape != (self.workspace.dim,):
+            raise ValueError(f"one goal position of shape ({self.workspace.dim},) is needed, got {tuple(goal.shape)}")
+        return goal.numpy()
 
     def _observation_space(self) -> spaces.Dict:
         size, objects, dim = self.image_size, len(self.objects), self.workspace.dim

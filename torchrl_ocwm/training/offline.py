@@ -9,7 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState
-from torchrl.trainers import OptimizationStepper, Trainer
+from torchrl.trainers import LRSchedulerHook, Trainer
+from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.checkpoint import check_same_agent, describe
@@ -18,7 +19,7 @@ from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.training.hooks import Every, ProgressBar, UpdateClock, stop_on_signals, stop_when_not_finite
 from torchrl_ocwm.training.loggers import Loggers, make_loggers
 from torchrl_ocwm.training.settings import Training
-from torchrl_ocwm.training.stepper import make_stepper
+from torchrl_ocwm.training.stepper import make_schedule, make_stepper
 
 CHECKPOINT = "checkpoint.zip"
 _SHOWN = ("loss_model_pixels", "loss_model_object_position", "loss_actor", "loss_value")
@@ -70,6 +71,7 @@ def train_offline(
     stepper = make_stepper(agent, training)
     trainer = _make_trainer(agent, training, stepper, loggers, file)
     trainer.register_op("process_optim_batch", sample)
+    LRSchedulerHook(make_schedule(stepper.optimizer, training), interval="optim").register(trainer)
     trainer.register_op("post_optim_complete_log", stop_when_not_finite)
     ProgressBar(trainer, _SHOWN, disable=not progress)
     if evaluate is not None:
@@ -101,7 +103,7 @@ def _make_sampler(agent: Agent, dataset: EpisodeDataset, training: Training) -> 
 
 
 def _make_trainer(
-    agent: Agent, training: Training, stepper: OptimizationStepper, loggers: Loggers, file: Path
+    agent: Agent, training: Training, stepper: DreamerV3OptimizationStepper, loggers: Loggers, file: Path
 ) -> Trainer:
     return Trainer(
         collector=UpdateClock(training.log_interval),

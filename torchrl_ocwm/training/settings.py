@@ -29,6 +29,8 @@ class Training:
         compile: Compile the update; ``None`` does so on a GPU only. Takes minutes.
         cudagraph: Capture the update in a CUDA graph; ``None`` does so on a GPU.
         mixed_precision: bfloat16 on a GPU.
+        final_lr: Share of the learning rates that is left at the last update; they fall linearly. A policy stops within
+            millimetres of its goal only with a small one (docs/results/reacher).
         target_rate: Share of the critic that moves into the slow critic at each update.
         loggers: Where to log beside the CSV files.
     """
@@ -47,6 +49,7 @@ class Training:
     compile: bool | None = None
     cudagraph: bool | None = None
     mixed_precision: bool = False
+    final_lr: float = 0.1
     target_rate: float = 0.02
     loggers: tuple[Literal["tensorboard", "wandb"], ...] = field(default=())
 

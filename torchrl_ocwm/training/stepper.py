@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LinearLR
 from torchrl.objectives import SoftUpdate
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper, DreamerV3Optimizer
 
@@ -20,6 +22,11 @@ def make_optimizer(agent: Agent) -> DreamerV3Optimizer:
     return DreamerV3Optimizer(
         [{"params": list(parameters), "lr": rate} for parameters, rate in groups], warmup_steps=size.warmup
     )
+
+
+def make_schedule(optimizer: Optimizer, training: Training) -> LinearLR:
+    """Learning rates that fall linearly over a run."""
+    return LinearLR(optimizer, 1.0, training.final_lr, total_iters=training.updates)
 
 
 def make_stepper(agent: Agent, training: Training) -> DreamerV3OptimizationStepper:
