@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchrl_ocwm.agents import AGENTS, SIZES, build_agent
+from torchrl_ocwm.modules.networks import make_image_decoder, make_image_encoder, make_mlp
+from torchrl_ocwm.testing import random_records, reacher_task
+
+
+@pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
+def test_styles_build_an_agent_that_learns_from_a_batch(style: str) -> None:
+    size = replace(SIZES["debug"], style=style)
+    loss = build_agent("dreamer_pcp", reacher_task(), size).loss
+    losses = loss(random_records(reacher_task(), 2, 3))
+    assert all(value.isfinite() for name, value in losses.items() if name.startswith("loss_"))
+
+
+@pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
+def test_image_shapes(style: str) -> None:
+    encoder, features = make_image_encoder(style, 64, depth=2, mults=(1, 2, 2, 2))
+    assert encoder(torch.zeros(2, 5, 3, 64, 64, dtype=torch.uint8)).shape == (2, 5, features)
+    decoder = make_image_decoder(style, 7, 64, depth=2, mults=(1, 2, 2, 2))
+    assert decoder(torch.zeros(2, 5, 4), torch.zeros(2, 5, 3)).shape == (2, 5, 3, 64, 64)
+
+
+@pytest.mark.parametrize(
+    ("style", "image_size", "message"),
+    [
+        ("dreamer_v3", 60, "halves the image 4 times, which an image of 60 x 60 pixels does not allow"),
+        ("dreamer_v2", 32, "takes images of 64 x 64 pixels, got 32 x 32"),
+    ],
+)
+def test_image_sizes_that_the_cnn_cannot_take(style: str, image_size: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build_agent("dreamer_pcp", reacher_task(image_size), replace(SIZES["debug"], style=style))
+
+
+@pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
+def test_outscale_zero_starts_at_zero(style: str) -> None:
+    assert make_mlp(style, 3, 2, layers=2, units=8, outscale=0.0)(torch.randn(5, 3)).abs().max() == 0
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_every_size_builds(name: str) -> None:
+    with torch.device("meta"):
+        agent = build_agent(AGENTS["dreamer_pcp"], reacher_task(), name)
+    assert agent.model.belief == SIZES[name].belief
+    assert agent.model.state == SIZES[name].categoricals * SIZES[name].classes

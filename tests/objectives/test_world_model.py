@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.objectives import DreamerV3ModelLoss
+
+from torchrl_ocwm.objectives import WorldModelLoss
+from torchrl_ocwm.objectives.world_model import image_reconstruction, symlog_reconstruction
+
+VECTORS = ("proprio", "object_units", "goal_units")
+
+
+def torchrl_loss(world_model: TensorDictModule) -> DreamerV3ModelLoss:
+    loss = DreamerV3ModelLoss(
+        world_model,
+        lambda_continue=1.0,
+        kl_mode="separate",
+        unimix=0.01,
+        reco_symlog=[False, True, True, True],
+        detach_output=False,
+    )
+    loss.set_keys(pixels=["pixels", *VECTORS], reco_pixels=["reco_pixels", *(f"reco_{name}" for name in VECTORS)])
+    return loss
+
+
+def test_sums_to_torchrls_loss(make_agent: Any, records: TensorDict) -> None:
+    world_model = make_agent("dreamer").model.records()
+    torch.manual_seed(1)
+    ours, _ = WorldModelLoss(world_model)(records)
+    torch.manual_seed(1)
+    theirs, _ = torchrl_loss(world_model)(records)
+    parts = ("pixels", "proprio", "object_position", "goal_position")
+    torch.testing.assert_close(
+        sum(ours[f"loss_model_{part}"] for part in parts), theirs["loss_model_reco"].squeeze()
+    )
+    for name in ("dynamic", "representation", "reward", "continue"):
+        torch.testing.assert_close(ours[f"loss_model_{name}"], theirs[f"loss_model_{name}"].squeeze())
+
+
+def test_each_weight_scales_its_own_loss(make_agent: Any, records: TensorDict) -> None:
+    world_model = make_agent("dreamer").model.records()
+
+    def losses(**weights: float) -> TensorDict:
+        torch.manual_seed(1)
+        return WorldModelLoss(world_model, **weights)(records)[0]
+
+    plain = losses()
+    for name in plain.keys():
+        part = name.removeprefix("loss_model_")
+        before = 0.1 if part == "representation" else 1.0
+        scaled = losses(**{f"lambda_{part}": 7.0})
+        torch.testing.assert_close(scaled[name], plain[name] * 7 / before)
+        for other in set(plain.keys()) - {name}:
+            torch.testing.assert_close(scaled[other], plain[other])
+
+
+@pytest.mark.parametrize(
+    "part", ["pixels", "proprio", "object_position", "goal_position", "reward", "continue", "dynamic", "representation"]
+)
+def test_gradients(make_agent: Any, records: TensorDict, part: str) -> None:
+    """Each loss alone reaches its own head and the RSSM, and no other head."""
+    agent = make_agent("dreamer")
+    losses, _ = WorldModelLoss(agent.model.records(), free_nats=0.0)(records)
+    losses[f"loss_model_{part}"].backward()
+    reached = {
+        name.split(".")[0] if not name.startswith("vector_decoders") else name.split(".")[1]
+        for name, parameter in agent.model.named_parameters()
+        if parameter.grad is not None and parameter.grad.abs().sum() > 0
+    }
+    heads = {"pixels": "image_decoder", "reward": "reward_head", "continue": "continue_head"}
+    expected = {"prior", "posterior", "encoder"}
+    if part not in ("dynamic", "representation"):
+        expected.add(heads.get(part, part))
+    if part == "dynamic":  # the posterior is the target: it learns only through the states it led to
+        assert {"prior"} <= reached <= expected
+    else:
+        assert reached == expected
+
+
+def test_a_missing_prediction_is_left_out(make_agent: Any, records: TensorDict) -> None:
+    losses, _ = WorldModelLoss(make_agent("dreamer_pcp").model.records())(records)
+    assert not {"loss_model_goal_position", "loss_model_reward"} & set(losses.keys())
+
+
+def test_free_nats_act_on_each_step() -> None:
+    """Two steps, one with no KL and one with ln 2: with one free nat each counts as one."""
+    logits = torch.tensor([[[[0.0, 0.0]], [[50.0, -50.0]]]])
+    prior = torch.zeros(1, 2, 1, 2)
+    model = TensorDictModule(
+        lambda x: (x, prior), in_keys=["logits"], out_keys=[("next", "posterior_logits"), ("next", "prior_logits")]
+    )
+    records = TensorDict({"logits": logits, "next": {}}, [1, 2])
+    loss, _ = WorldModelLoss(model, free_nats=1.0, unimix=0.0)(records)
+    torch.testing.assert_close(loss["loss_model_dynamic"], torch.tensor(1.0))
+    loss, _ = WorldModelLoss(model, free_nats=0.0, unimix=0.0)(records)
+    torch.testing.assert_close(loss["loss_model_dynamic"], torch.tensor(2.0).log() / 2)
+
+
+def test_set_keys_nested(make_agent: Any, records: TensorDict) -> None:
+    model = make_agent("dreamer").model
+    torch.manual_seed(1)
+    expected, _ = WorldModelLoss(model.records())(records)
+    rename = TensorDictModule(nn.Identity(), [("next", "reco_proprio")], [("next", "predicted", "proprio")])
+    moved = records.clone()
+    moved["next", "reward_of", "task"] = moved["next"].pop("reward")
+    loss = WorldModelLoss(TensorDictSequential(model.records(), rename))
+    loss.set_keys(reward=("reward_of", "task"), reco_proprio=("predicted", "proprio"))
+    torch.manual_seed(1)
+    losses, _ = loss(moved)
+    for name, value in expected.items():
+        torch.testing.assert_close(losses[name], value)
+
+
+def test_the_batch_is_left_alone(make_agent: Any, records: TensorDict) -> None:
+    before = records.clone()
+    WorldModelLoss(make_agent("dreamer").model.records())(records)
+    assert (records == before).all()
+    assert set(records.keys(True, True)) == set(before.keys(True, True))
+
+
+def test_a_missing_key_is_named(make_agent: Any, records: TensorDict) -> None:
+    del records["next", "proprio"]
+    with pytest.raises(KeyError, match=r"lacks.*next.*proprio.*which the world model reads"):
+        WorldModelLoss(make_agent().model.records())(records)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        (("next", "pixels"), torch.zeros(2, 6, 3, 32, 32, dtype=torch.uint8), r"\(3, 64, 64\)\), got \(.*3, 32, 32\)"),
+        (("next", "proprio"), torch.zeros(2, 6, 4), r"vectors of 7 values in all"),
+        (("next", "object_position"), torch.zeros(2, 6, 1, 3), r"positions have 2 coordinates here, got shape"),
+    ],
+)
+def test_wrong_shapes(make_agent: Any, records: TensorDict, key: Any, value: torch.Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        WorldModelLoss(make_agent().model.records())(records.set(key, value))
+
+
+def test_reconstructions_by_hand() -> None:
+    target = torch.tensor([[[[255, 0]]]], dtype=torch.uint8)
+    torch.testing.assert_close(image_reconstruction(torch.tensor([[[[0.5, 0.25]]]]), target), torch.tensor(0.3125))
+    prediction, target = torch.tensor([[1.0, 0.0]]), torch.tensor([[-1.0, 0.0]])
+    torch.testing.assert_close(symlog_reconstruction(prediction, target), torch.tensor(2.0).log().mul(2).square())
