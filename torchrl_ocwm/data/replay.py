@@ -66,7 +66,7 @@ def make_replay_buffer(
         DatasetError: if an episode is shorter than ``slice_len``.
 
     Examples:
-        >>> import tempfile
+        >>> import tempfile, torch
         >>> from tensordict import TensorDict
         >>> records = TensorDict({"action": torch.zeros(9, 2), "is_init": (torch.arange(9) == 0).unsqueeze(-1),
         ...     "next": {"observation": torch.rand(9, 4)}}, [9])

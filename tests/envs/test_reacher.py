@@ -1,0 +1,489 @@
+"""The Reacher environment: data contract, goals, physics, hidden objects, virtual target, goal observations."""
+
+import importlib.util
+import warnings
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from dm_control import suite
+from dm_control.suite import reacher as dm_reacher
+from gymnasium.utils.env_checker import check_env
+
+from torchrl_ocwm.envs import Reacher
+
+LINK = 0.12
+GOAL = np.array([0.1, -0.12], np.float32)
+REACHABLE = [(0.1, 0.1), (-0.2, 0.05), (0.0, -0.23), (0.05, 0.0)]
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = Reacher()
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def twin():
+    env = Reacher()
+    yield env
+    env.close()
+
+
+def actions(number: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, (number, 2))
+
+
+def assert_same(first, second):
+    assert first.keys() == second.keys()
+    for key in first:
+        assert np.array_equal(first[key], second[key]), key
+
+
+def finger(env: Reacher) -> int:
+    return env.model.geom("finger").id
+
+
+@pytest.fixture
+def hide(env):
+    """Make the finger tip invisible, and visible again after the test."""
+    colour = env.model.geom_rgba[finger(env)].copy()
+
+    def hide(hidden: bool = True):
+        env.model.geom_rgba[finger(env), 3] = 0 if hidden else colour[3]
+
+    yield hide
+    env.model.geom_rgba[finger(env)] = colour
+
+
+def test_gymnasium_checker():
+    env = gymnasium.make("ocwm/Reacher-v0", render_mode="rgb_array")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped)
+    env.close()
+    # Positions have no bounds; that is all it may complain about.
+    assert [str(w.message) for w in caught if "infinity" not in str(w.message)] == []
+
+
+# The data contract.
+
+
+def test_observation_has_the_keys_shapes_and_types_of_the_contract(env):
+    observation, _ = env.reset(seed=0)
+    assert {key: (value.shape, value.dtype) for key, value in observation.items()} == {
+        "pixels": ((3, 64, 64), np.uint8),
+        "masks": ((1, 64, 64), np.bool_),
+        "proprio": ((5,), np.float32),
+        "object_position": ((1, 2), np.float32),
+        "object_visible": ((1,), np.bool_),
+        "goal_position": ((2,), np.float32),
+        "object_position_true": ((1, 2), np.float32),
+    }
+    assert env.observation_space.contains(observation)
+    assert env.observation_space.contains(env.step(np.ones(2))[0])
+
+
+def test_true_position_and_proprio_follow_the_joints(env):
+    env.reset(seed=1)
+    for action in actions(5):
+        observation, *_ = env.step(action)
+        shoulder, wrist = env.data.qpos
+        expected = LINK * np.array(
+            [np.cos(shoulder) + np.cos(shoulder + wrist), np.sin(shoulder) + np.sin(shoulder + wrist)]
+        )
+        assert observation["object_position_true"][0] == pytest.approx(expected, abs=1e-6)
+        proprio = [np.cos(shoulder), np.sin(shoulder), wrist, *env.data.qvel]
+        assert observation["proprio"] == pytest.approx(np.array(proprio), rel=1e-6)
+
+
+def test_mask_is_the_finger_in_the_picture(env):
+    """The mask lies where a camera 74 cm above the finger, with a view of 45 degrees, sees it."""
+    for seed in range(10):
+        observation, _ = env.reset(seed=seed)
+        rows, columns = np.nonzero(observation["masks"][0])
+        x, y = observation["object_position_true"][0]
+        focal = 32 / np.tan(np.deg2rad(22.5))
+        assert columns.mean() + 0.5 == pytest.approx(32 + focal * x / 0.74, abs=0.5)
+        assert rows.mean() + 0.5 == pytest.approx(32 - focal * y / 0.74, abs=0.5)
+
+
+def test_reward_is_minus_the_distance_in_metres(env):
+    env.reset(seed=2, options={"goal_position": GOAL})
+    for action in actions(5):
+        observation, reward, *_ = env.step(action)
+        x, y = (float(v) for v in observation["object_position"][0])
+        assert reward == pytest.approx(-(((x - 0.1) ** 2 + (y + 0.12) ** 2) ** 0.5), abs=1e-6)
+
+
+@pytest.mark.parametrize(("distance", "success"), [(0.0, True), (0.048, True), (0.052, False), (0.1, False)])
+def test_success_within_five_centimetres(env, distance, success):
+    start, _ = env.reset(seed=3)
+    position = start["object_position"][0]
+    goal = position - distance * position / np.linalg.norm(position)
+    _, info = env.reset(seed=3, options={"goal_position": goal})
+    assert info == {"success": success}
+    # The arm is at rest, so one step without torque does not move it.
+    observation, _, _, _, info = env.step(np.zeros(2))
+    assert np.array_equal(observation["object_position"][0], position)
+    assert info == {"success": success}
+
+
+def test_render_shows_the_pixels(env):
+    observation, _ = env.reset(seed=0)
+    assert env.render() is None
+    with_picture = Reacher(render_mode="rgb_array", image_size=64)
+    with_picture.reset(seed=0)
+    picture = with_picture.render()
+    with_picture.close()
+    assert np.array_equal(picture.transpose(2, 0, 1), observation["pixels"])
+
+
+@pytest.mark.parametrize("image_size", [48, 96])
+def test_image_size(image_size):
+    env = Reacher(image_size=image_size)
+    observation, _ = env.reset(seed=0)
+    env.close()
+    assert observation["pixels"].shape == (3, image_size, image_size)
+    assert observation["masks"].shape == (1, image_size, image_size)
+    # A pixel is 62 cm / image_size wide: 45 degrees, 75 cm above the table.
+    error = np.linalg.norm(observation["object_position"] - observation["object_position_true"])
+    assert error < 0.62 / image_size
+
+
+def test_the_task_has_no_target_of_its_own_in_the_picture(env):
+    env.reset(seed=0)
+    assert env.model.geom("target").rgba[3] == 0
+    assert not (env.camera.render(env.data).geoms == env.model.geom("target").id).any()
+
+
+# Goals.
+
+
+def test_goals_are_uniform_in_the_workspace(env):
+    env.reset(seed=0)
+    goals = np.stack([env.reset()[0]["goal_position"] for _ in range(400)])
+    assert len(np.unique(goals, axis=0)) == 400
+    assert (np.abs(goals) <= 0.24).all()
+    # Four standard deviations of a binomial with 400 draws.
+    quadrants = np.bincount((goals > 0) @ [1, 2], minlength=4)
+    assert quadrants == pytest.approx(100, abs=4 * (400 * 0.25 * 0.75) ** 0.5)
+    corners = (np.linalg.norm(goals, axis=1) > 0.24).mean()
+    share = 1 - np.pi / 4
+    assert corners == pytest.approx(share, abs=4 * (share * (1 - share) / 400) ** 0.5)
+
+
+def test_start_states_are_uniform_in_the_joint_angles(env):
+    env.reset(seed=0)
+    angles = np.stack([(env.reset(), env.data.qpos.copy())[1] for _ in range(400)])
+    limits = np.array([np.pi, np.deg2rad(160)])
+    assert (np.abs(angles) <= limits).all()
+    # Mean and standard deviation of a uniform variable, four standard errors.
+    assert angles.mean(0) / limits == pytest.approx(0, abs=4 / 3**0.5 / 20)
+    assert angles.std(0) / limits == pytest.approx(1 / 3**0.5, rel=0.1)
+
+
+def test_given_goal(env):
+    observation, _ = env.reset(options={"goal_position": GOAL})
+    assert np.array_equal(observation["goal_position"], GOAL)
+    assert np.array_equal(env.step(np.ones(2))[0]["goal_position"], GOAL)
+    drawn, _ = env.reset()
+    assert not np.array_equal(drawn["goal_position"], GOAL)
+
+
+def test_given_goal_does_not_change_the_start(env):
+    drawn, _ = env.reset(seed=5)
+    following, _ = env.reset()
+    given, _ = env.reset(seed=5, options={"goal_position": GOAL})
+    following_given, _ = env.reset()
+    assert not np.array_equal(drawn.pop("goal_position"), given.pop("goal_position"))
+    assert_same(drawn, given)
+    assert_same(following, following_given)
+
+
+# Physics and time.
+
+
+def test_two_control_steps_per_step_by_default(env):
+    env.reset(seed=6)
+    model = mujoco.MjModel.from_xml_string(*dm_reacher.get_model_and_assets())
+    data = mujoco.MjData(model)
+    data.qpos[:] = env.data.qpos
+    mujoco.mj_forward(model, data)
+    for action in actions(20):
+        env.step(action)
+        data.ctrl[:] = action
+        mujoco.mj_step(model, data)
+        mujoco.mj_step(model, data)
+        assert np.array_equal(env.data.qpos, data.qpos)
+        assert np.array_equal(env.data.qvel, data.qvel)
+        mujoco.mj_forward(model, data)
+        assert np.array_equal(env.data.geom_xpos, data.geom_xpos)
+
+
+@pytest.mark.parametrize("repeat", [1, 3])
+def test_physics_are_those_of_dm_control(repeat):
+    env = Reacher(action_repeat=repeat, image_size=8)
+    env.reset(seed=7)
+    original = suite.load("reacher", "easy")
+    original.reset()
+    with original.physics.reset_context():
+        original.physics.data.qpos[:] = env.data.qpos
+        original.physics.data.qvel[:] = 0
+    for action in actions(10):
+        env.step(action)
+        for _ in range(repeat):
+            original.step(action)
+        assert env.data.qpos == pytest.approx(original.physics.data.qpos, abs=1e-9)
+    env.close()
+
+
+def test_actions_are_clipped(env, twin):
+    env.reset(seed=8)
+    twin.reset(seed=8)
+    assert_same(env.step(np.array([3.0, -7.0]))[0], twin.step(np.array([1.0, -1.0]))[0])
+
+
+def test_horizon_truncates_exactly():
+    env = Reacher(horizon=7, image_size=8)
+    for _ in range(2):
+        env.reset()
+        ends = [env.step(np.zeros(2))[2:4] for _ in range(7)]
+        assert ends == [(False, False)] * 6 + [(False, True)]
+    env.close()
+
+
+def test_same_seed_same_everything(env, twin):
+    assert_same(env.reset(seed=9)[0], twin.reset(seed=9)[0])
+    for action in actions(10):
+        first, second = env.step(action), twin.step(action)
+        assert_same(first[0], second[0])
+        assert first[1:] == second[1:]
+    assert_same(env.reset()[0], twin.reset()[0])
+
+
+def test_other_seed_other_start(env, twin):
+    first, second = env.reset(seed=10)[0], twin.reset(seed=11)[0]
+    for key in ("pixels", "proprio", "goal_position", "object_position_true"):
+        assert not np.array_equal(first[key], second[key])
+
+
+def test_closing_one_environment_leaves_the_other_alone(env):
+    before, _ = env.reset(seed=12)
+    other = Reacher()
+    other.reset(seed=13)
+    env.reset(seed=14)
+    other.close()
+    assert_same(env.reset(seed=12)[0], before)
+
+
+# Positions from masks.
+
+
+def load_benchmark():
+    path = Path(__file__).parents[2] / "benchmarks" / "position_error.py"
+    spec = importlib.util.spec_from_file_location("position_error", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_position_error_over_random_poses():
+    errors = load_benchmark().position_errors(100)
+    assert not np.isnan(errors).any()
+    assert np.median(errors) < 3.0
+    assert np.percentile(errors, 95) < 4.5
+
+
+def test_position_error_sees_hidden_poses_and_wrong_positions(monkeypatch):
+    module = load_benchmark()
+
+    class Wrong(Reacher):
+        def reset(self, **kwargs):
+            observation, info = super().reset(**kwargs)
+            observation["object_position"] = observation["object_position_true"] + np.array([[0.003, 0.004]])
+            observation["object_visible"] = np.array([self.np_random.random() < 0.5])
+            return observation, info
+
+    monkeypatch.setattr(module, "Reacher", Wrong)
+    errors = module.position_errors(20)
+    assert 0 < np.isnan(errors).sum() < 20
+    assert errors[~np.isnan(errors)] == pytest.approx(5.0, abs=1e-3)
+
+
+def test_hidden_object_keeps_its_last_position(env, hide):
+    env.reset(seed=14, options={"goal_position": GOAL})
+    seen, *_ = env.step(np.ones(2))
+    hide()
+    for _ in range(3):
+        hidden, reward, *_ = env.step(np.ones(2))
+        assert hidden["object_visible"].tolist() == [False]
+        assert not hidden["masks"].any()
+        assert np.array_equal(hidden["object_position"], seen["object_position"])
+        assert not np.array_equal(hidden["object_position_true"], seen["object_position_true"])
+        assert reward == pytest.approx(-np.linalg.norm(seen["object_position"][0] - GOAL), abs=1e-6)
+    hide(False)
+    again, *_ = env.step(np.ones(2))
+    assert again["object_visible"].tolist() == [True]
+    assert np.linalg.norm(again["object_position"] - again["object_position_true"]) < 0.005
+
+
+def test_hidden_from_the_start_is_zero(env, hide):
+    env.reset(seed=15)
+    env.step(np.ones(2))
+    hide()
+    observation, _ = env.reset(seed=16)
+    assert observation["object_visible"].tolist() == [False]
+    assert observation["object_position"].tolist() == [[0.0, 0.0]]
+
+
+# Virtual target.
+
+
+def pictures(diameter: int, goal, seed: int = 17):
+    """Observations of the same state without and with a virtual target."""
+    plain, painted = Reacher(), Reacher(virtual_target=diameter)
+    both = [env.reset(seed=seed, options={"goal_position": goal})[0] for env in (plain, painted)]
+    both += [env.step(np.ones(2))[0] for env in (plain, painted)]
+    plain.close()
+    painted.close()
+    return both
+
+
+def test_no_target_by_default(env):
+    plain, drawn, *_ = pictures(0, GOAL)
+    by_default, _ = env.reset(seed=17, options={"goal_position": GOAL})
+    assert_same(plain, drawn)
+    assert_same(plain, by_default)
+
+
+def test_target_of_one_pixel_lies_at_the_goal():
+    for goal in [(0.1, -0.12), (-0.2, 0.2), (0.24, 0.24)]:
+        for plain, painted in zip(*[iter(pictures(1, goal))] * 2, strict=True):
+            changed = (plain["pixels"] != painted["pixels"]).any(0)
+            rows, columns = np.nonzero(changed)
+            # Camera 74 cm above the finger's plane, 45 degrees over 64 pixels.
+            focal = 32 / np.tan(np.deg2rad(22.5))
+            assert columns.tolist() == [int(32 + focal * goal[0] / 0.74)]
+            assert rows.tolist() == [int(32 - focal * goal[1] / 0.74)]
+
+
+@pytest.mark.parametrize("diameter", [6, 10, 16])
+def test_area_of_the_target(diameter):
+    plain, painted, *_ = pictures(diameter, (-0.1, 0.12))
+    assert not (plain["masks"][0] & (plain["pixels"] != painted["pixels"]).any(0)).any()
+    changed = (plain["pixels"] != painted["pixels"]).any(0)
+    assert changed.sum() == pytest.approx(np.pi * diameter**2 / 4, rel=0.1)
+    rows, columns = np.nonzero(changed)
+    focal = 32 / np.tan(np.deg2rad(22.5))
+    assert columns.mean() + 0.5 == pytest.approx(32 - focal * 0.1 / 0.74, abs=0.5)
+    assert rows.mean() + 0.5 == pytest.approx(32 - focal * 0.12 / 0.74, abs=0.5)
+
+
+def test_target_is_never_drawn_over_the_object(env):
+    start, _ = env.reset(seed=17)
+    plain, painted, *_ = pictures(12, start["object_position"][0])
+    entity = plain["masks"][0]
+    assert np.array_equal(plain["pixels"][:, entity], painted["pixels"][:, entity])
+    assert (plain["pixels"] != painted["pixels"]).any()
+
+
+def test_target_changes_nothing_but_pixels():
+    plain, painted, *later = pictures(16, GOAL)
+    for without, with_target in ((plain, painted), later):
+        assert not np.array_equal(without.pop("pixels"), with_target.pop("pixels"))
+        assert_same(without, with_target)
+
+
+# Goal observations.
+
+
+@pytest.mark.parametrize("goal", REACHABLE)
+def test_goal_observation_shows_the_object_at_the_goal(env, goal):
+    env.reset(seed=18)
+    env.step(np.ones(2))
+    observation = env.goal_observation(goal)
+    assert env.observation_space.contains(observation)
+    assert observation["object_position_true"][0] == pytest.approx(np.array(goal), abs=1e-6)
+    assert np.linalg.norm(observation["object_position"][0] - goal) < 0.005
+    assert observation["goal_position"] == pytest.approx(np.array(goal))
+    assert observation["proprio"][3:].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(("goal", "distance"), [((0.24, 0.24), 0.24), ((0.02, 0.0), 0.24 * np.cos(np.deg2rad(80)))])
+def test_goal_observation_of_an_unreachable_goal_is_the_nearest(env, goal, distance):
+    env.reset(seed=18)
+    position = env.goal_observation(goal)["object_position_true"][0]
+    assert position == pytest.approx(distance * np.array(goal) / np.linalg.norm(goal), abs=1e-6)
+
+
+def test_goal_observation_leaves_the_episode_alone(env, twin):
+    env.reset(seed=19)
+    twin.reset(seed=19)
+    for action in actions(6):
+        qpos, qvel, time = env.data.qpos.copy(), env.data.qvel.copy(), env.data.time
+        for goal in REACHABLE:
+            env.goal_observation(goal)
+        assert np.array_equal(env.data.qpos, qpos)
+        assert np.array_equal(env.data.qvel, qvel)
+        assert env.data.time == time
+        first, second = env.step(action), twin.step(action)
+        assert_same(first[0], second[0])
+        assert first[1:] == second[1:]
+    assert_same(env.reset()[0], twin.reset()[0])
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [
+        ((0.3, 0.0), "lies outside the workspace"),
+        ((0.1, 0.1, 0.1), "has 2 coordinates, got shape"),
+        (((0.1, 0.1), (0.0, 0.0)), r"one goal position of shape \(2,\) is needed, got \(2, 2\)"),
+        ((float("nan"), 0.0), "must be finite"),
+    ],
+)
+def test_bad_goals(env, goal, message):
+    with pytest.raises(ValueError, match=message):
+        env.reset(options={"goal_position": goal})
+    with pytest.raises(ValueError, match=message):
+        env.goal_observation(goal)
+
+
+def test_unknown_reset_option(env):
+    with pytest.raises(ValueError, match=r"unknown reset options \['target'\]; the only one is 'goal_position'"):
+        env.reset(options={"target": GOAL})
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(3), r"has shape \(2,\), got \(3,\)"),
+        (np.zeros((1, 2)), r"has shape \(2,\), got \(1, 2\)"),
+        (np.array([0.0, np.nan]), "must be finite"),
+        (np.array([np.inf, 0.0]), "must be finite"),
+    ],
+)
+def test_bad_actions(env, action, message):
+    env.reset(seed=20)
+    before = env.data.qpos.copy()
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    assert np.array_equal(env.data.qpos, before)
+
+
+@pytest.mark.parametrize("name", ["image_size", "horizon", "action_repeat"])
+@pytest.mark.parametrize("value", [0, -1])
+def test_sizes_below_one(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be at least 1, got {value}"):
+        Reacher(**{name: value})
+
+
+def test_negative_target():
+    with pytest.raises(ValueError, match="virtual_target is a diameter in pixels, 0 for none; got -1"):
+        Reacher(virtual_target=-1)

@@ -1,0 +1,156 @@
+"""make_env and make_task: names, seeds, goals, several processes, and what is said when a simulator is missing."""
+
+import gymnasium
+import pytest
+import torch
+from torchrl.envs import ParallelEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_ocwm.envs import ENVIRONMENTS, Reacher, Task, make_env, make_task, registry
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = make_env("reacher", horizon=4)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def pair():
+    env = make_env("reacher", num_envs=2, seed=0, image_size=16, horizon=5)
+    yield env
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_torchrl_specs(env):
+    check_env_specs(env)
+
+
+def test_every_environment_is_registered_with_gymnasium():
+    for environment in ENVIRONMENTS.values():
+        assert gymnasium.spec(environment.id).entry_point == environment.entry_point
+
+
+def test_keys_of_a_rollout(env):
+    rollout = env.rollout(10, break_when_any_done=True)
+    assert rollout.batch_size == (4,)
+    shapes = {key: (value.shape[1:], value.dtype) for key, value in rollout["next"].items()}
+    assert shapes == {
+        "pixels": ((3, 64, 64), torch.uint8),
+        "masks": ((1, 64, 64), torch.bool),
+        "proprio": ((5,), torch.float32),
+        "object_position": ((1, 2), torch.float32),
+        "object_visible": ((1,), torch.bool),
+        "goal_position": ((2,), torch.float32),
+        "object_position_true": ((1, 2), torch.float32),
+        "is_init": ((1,), torch.bool),
+        "reward": ((1,), torch.float32),
+        "done": ((1,), torch.bool),
+        "terminated": ((1,), torch.bool),
+        "truncated": ((1,), torch.bool),
+    }
+    assert rollout["is_init"].flatten().tolist() == [True, False, False, False]
+    assert rollout["next", "truncated"].flatten().tolist() == [False, False, False, True]
+    assert not rollout["next", "terminated"].any()
+
+
+def test_goal_at_reset(env):
+    goal = torch.tensor([0.12, -0.03])
+    first = env.reset(options={"goal_position": goal.numpy()})
+    assert torch.equal(first["goal_position"], goal)
+    rollout = env.rollout(3, auto_reset=False, tensordict=first)
+    assert torch.equal(rollout["next", "goal_position"], goal.expand(3, 2))
+    distance = (rollout["next", "object_position"][:, 0] - goal).norm(dim=-1, keepdim=True)
+    assert torch.allclose(rollout["next", "reward"], -distance, atol=1e-6)
+
+
+def test_seed_repeats_a_rollout(env):
+    rollouts = []
+    for _ in range(2):
+        env.set_seed(7)
+        torch.manual_seed(0)
+        rollouts.append(env.rollout(4))
+    assert (rollouts[0] == rollouts[1]).all()
+
+
+def test_seed_argument():
+    starts = []
+    for seed in (1, 1, 2):
+        env = make_env("ocwm/Reacher-v0", seed=seed, image_size=16)
+        assert isinstance(env, TransformedEnv)
+        starts.append(env.reset()["proprio"])
+        env.close()
+    assert torch.equal(starts[0], starts[1])
+    assert not torch.equal(starts[0], starts[2])
+
+
+def test_two_processes(pair):
+    assert isinstance(pair, ParallelEnv)
+    rollout = pair.rollout(5)
+    assert rollout.batch_size == (2, 5)
+    assert rollout["next", "pixels"].shape == (2, 5, 3, 16, 16)
+    assert rollout["next", "done"][:, -1].all()
+    # Seeded differently.
+    assert not torch.equal(rollout["proprio"][0, 0], rollout["proprio"][1, 0])
+
+
+def test_two_processes_share_a_goal(pair):
+    goal = torch.tensor([0.1, 0.05])
+    assert torch.equal(pair.reset(options={"goal_position": goal.numpy()})["goal_position"], goal.expand(2, 2))
+
+
+def test_two_processes_with_a_goal_each(pair):
+    goals = torch.tensor([[0.1, 0.05], [-0.2, 0.0]])
+    first = pair.reset(list_of_kwargs=[{"options": {"goal_position": goal.numpy()}} for goal in goals])
+    assert torch.equal(first["goal_position"], goals)
+    rollout = pair.rollout(3, auto_reset=False, tensordict=first)
+    assert torch.equal(rollout["next", "goal_position"], goals[:, None].expand(2, 3, 2))
+
+
+def test_two_processes_repeat_with_their_seed(pair):
+    starts = []
+    for _ in range(2):
+        pair.set_seed(3)
+        starts.append(pair.reset()["proprio"].clone())
+    assert torch.equal(*starts)
+
+
+def test_task_describes_the_environment():
+    task = make_task("reacher", image_size=32, virtual_target=3, horizon=9)
+    assert task == Task(
+        name="reacher",
+        image_size=32,
+        objects=("finger",),
+        proprio=5,
+        action=2,
+        workspace=Reacher.workspace,
+        options={"image_size": 32, "virtual_target": 3},
+    )
+
+
+@pytest.mark.parametrize("make", [make_env, make_task])
+def test_unknown_name_lists_the_others(make):
+    with pytest.raises(ValueError, match=r"unknown environment 'reach'; there are reacher"):
+        make("reach")
+
+
+@pytest.mark.parametrize("make", [make_env, make_task])
+@pytest.mark.parametrize("missing", ["gymnasium", "dm_control"])
+def test_missing_simulator_says_what_to_install(monkeypatch, make, missing):
+    monkeypatch.setattr(registry, "find_spec", lambda name: None if name == missing else True)
+    with pytest.raises(
+        ModuleNotFoundError, match=rf"'reacher' needs {missing}.*pip install 'torchrl-ocwm\[dm-control\]"
+    ):
+        make("reacher")
+
+
+def test_number_of_environments():
+    with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
+        make_env("reacher", num_envs=0)
+
+
+def test_options_reach_the_environment():
+    with pytest.raises(ValueError, match="horizon must be at least 1, got 0"):
+        make_env("reacher", horizon=0)
