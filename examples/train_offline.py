@@ -24,21 +24,22 @@ from torchrl_ocwm.training.settings import Training
 def main(config: DictConfig) -> None:
     training = to_dataclass(Training, config.training)
     dataset = EpisodeDataset.open(config.dataset)
-    if dataset.metadata["environment"] != config.env.name:
-        raise DatasetError(f"{dataset.path}: holds {dataset.metadata['environment']}, not env={config.env.name}")
+    if dataset.metadata.get("environment") != config.env.name:
+        raise DatasetError(f"{dataset.path}: holds {dataset.metadata.get('environment')}, not env={config.env.name}")
     torch.manual_seed(training.seed)
     agent = build_agent(
         to_dataclass(AgentConfig, config.agent),
         Task.from_dict(dataset.metadata["task"]),
         to_dataclass(Size, config.size),
     )
+    evaluation = LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps)
     checkpoint = train_offline(
         agent,
         dataset,
         config.output,
         training,
-        evaluate=LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps),
-        film=OpenLoopFilm(agent, dataset),
+        evaluate=evaluation if training.eval_interval else None,
+        film=OpenLoopFilm(agent, dataset, Path(config.output) / "videos"),
     )
     print(f"checkpoint: {checkpoint}")
     print(f"log, videos: {checkpoint.parent}")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from tensordict import TensorDict
 
+from torchrl_ocwm.data.dataset import EpisodeDataset
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.envs.workspace import Workspace
 
@@ -46,3 +49,15 @@ def random_records(task: Task, batch: int, time: int, *, seed: int = 0) -> Tenso
         },
         shape,
     )
+
+
+def random_dataset(path: str | Path, task: Task, *, episodes: int = 4, length: int = 20) -> EpisodeDataset:
+    """A dataset of random episodes of ``length`` records each."""
+    records = random_records(task, episodes, length)
+    records["action"][:, 0] = 0
+    records["next", "done"][:, -1] = True
+    metadata = {"environment": task.name, "options": {}, "task": task.to_dict()}
+    dataset = EpisodeDataset.create(path, example=records[0, 0], metadata=metadata)
+    for episode in records:
+        dataset.append(episode)
+    return dataset

@@ -8,8 +8,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_ocwm.modules import Actor, InitialLatent, PositionDistanceReward, UniformGoals, WorkspaceUnits
-from torchrl_ocwm.modules import ObservationEncoder, position_distance
+from torchrl_ocwm.modules import (
+    Actor,
+    InitialLatent,
+    ObservationEncoder,
+    PositionDistanceReward,
+    UniformGoals,
+    WorkspaceUnits,
+    position_distance,
+)
 
 
 class TestWorkspaceUnits:

@@ -136,9 +136,7 @@ def test_imagined_reward_teaches_the_actor_through_the_dynamics(make_agent: Any,
     agent = make_agent()
     latent = agent.model.records()(records)["next"].select("state", "belief")
     start = agent.loss.imagination_start(latent)
-    rollout = agent.imagination.rollout(
-        3, agent.actor, auto_reset=False, tensordict=start, break_when_any_done=False
-    )
+    rollout = agent.imagination.rollout(3, agent.actor, auto_reset=False, tensordict=start, break_when_any_done=False)
     rollout["next", "reward"][:, -1].sum().backward()
     assert gradient_norm(agent.actor) > 0
 

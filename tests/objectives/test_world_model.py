@@ -35,9 +35,7 @@ def test_sums_to_torchrls_loss(make_agent: Any, records: TensorDict) -> None:
     torch.manual_seed(1)
     theirs, _ = torchrl_loss(world_model)(records)
     parts = ("pixels", "proprio", "object_position", "goal_position")
-    torch.testing.assert_close(
-        sum(ours[f"loss_model_{part}"] for part in parts), theirs["loss_model_reco"].squeeze()
-    )
+    torch.testing.assert_close(sum(ours[f"loss_model_{part}"] for part in parts), theirs["loss_model_reco"].squeeze())
     for name in ("dynamic", "representation", "reward", "continue"):
         torch.testing.assert_close(ours[f"loss_model_{name}"], theirs[f"loss_model_{name}"].squeeze())
 

@@ -129,11 +129,17 @@ class Agent(nn.Module):
                 f"goal={config.goal!r} does not go with goal_source={config.goal_source!r}: a policy that sees a goal "
                 "needs goals in imagination, and only that one"
             )
+        reward = REWARDS[config.reward](self.model)
+        if (GOAL in reward.in_keys) != bool(goal_features):
+            raise ValueError(
+                f"reward={config.reward!r} does not go with goal={config.goal!r}: an imagined reward has to judge by the "
+                "goal that the policy sees, and by no other"
+            )
         self.goal_encoder = goal_encoder
         self.actor = self._make_actor(goal_features)
         self.imagination = ImaginationEnv(
             self.model.transition(),
-            REWARDS[config.reward](self.model),
+            reward,
             state=self.model.state,
             belief=self.model.belief,
             action=task.action,
@@ -200,6 +206,7 @@ class Agent(nn.Module):
         config, size = self.config, self.size
         model_loss = WorldModelLoss(
             self.model.records(),
+            lambda_dynamic=size.lambda_dynamic,
             lambda_proprio=config.lambda_proprio,
             lambda_object_position=config.lambda_object_position,
             lambda_goal_position=config.lambda_goal_position,

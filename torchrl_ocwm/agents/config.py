@@ -81,6 +81,7 @@ class Size:
         warmup: Updates until the learning rates are reached.
         gamma: Discount of a step in imagination.
         entropy_bonus: Weight of the actor's entropy.
+        lambda_dynamic: Weight of the KL that trains the prior; that which trains the posterior has 0.1.
     """
 
     style: Literal["dreamer_v3", "dreamer_v2"]
@@ -102,13 +103,14 @@ class Size:
     warmup: int
     gamma: float = 0.99
     entropy_bonus: float = 3e-4
+    lambda_dynamic: float = 1.0
 
     def __post_init__(self) -> None:
         check_choices(self)
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, int) and value < (field.name != "warmup"):
-                raise ValueError(f"{field.name} must be positive, got {value}")
+            if field.type == "int" and field.name != "warmup" and value < 1:
+                raise ValueError(f"{field.name} must be at least 1, got {value}")
         if self.belief % self.gru_blocks:
             raise ValueError(f"belief must be a multiple of gru_blocks, got {self.belief} and {self.gru_blocks}")
 

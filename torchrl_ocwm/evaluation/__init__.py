@@ -1,6 +1,6 @@
 """How well it did: goals in a grid, scores, reconstruction errors, reports, pictures and videos.
 
-``plots`` and ``videos`` need the extra ``recipes``, so they are imported from their modules.
+Needs the extra ``recipes``; ``plots`` and ``videos`` are imported from their modules.
 """
 
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, measure

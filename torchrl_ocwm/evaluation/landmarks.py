@@ -19,20 +19,22 @@ class LandmarkEvaluation:
         episode_steps: Steps of each.
 
     Raises:
-        ValueError: for more episodes than the task has landmarks.
+        ValueError: when called, if there are more episodes than landmarks.
     """
 
     def __init__(self, agent: Agent, *, episodes: int, episode_steps: int) -> None:
-        landmarks = agent.task.workspace.landmarks
-        if episodes > len(landmarks):
-            raise ValueError(f"eval_episodes is {episodes}, but {agent.task.name} has {len(landmarks)} landmark goals")
-        self.policy, self.task, self.episode_steps = agent.policy(), agent.task, episode_steps
-        self.goals = torch.tensor(landmarks[:episodes])
+        self.policy, self.task = agent.policy(), agent.task
+        self.episodes, self.episode_steps = episodes, episode_steps
         self.envs: EvaluationEnvs | None = None
 
     def __call__(self, updates: int) -> dict[str, float]:  # noqa: ARG002
         """Scores to log."""
+        landmarks = self.task.workspace.landmarks
+        if self.episodes > len(landmarks):
+            raise ValueError(
+                f"{self.episodes} evaluation episodes, but {self.task.name} has {len(landmarks)} landmarks"
+            )
         if self.envs is None:
-            self.envs = EvaluationEnvs(self.task, episode_steps=self.episode_steps, workers=0, envs=len(self.goals))
-        scores = measure(self.envs.run(self.policy, self.goals))
+            self.envs = EvaluationEnvs(self.task, episode_steps=self.episode_steps, workers=0, envs=self.episodes)
+        scores = measure(self.envs.run(self.policy, torch.tensor(landmarks[: self.episodes])))
         return {f"evaluation/{name}": float(values.mean()) for name, values in scores.items()}

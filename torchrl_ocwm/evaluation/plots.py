@@ -64,7 +64,8 @@ def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict
         axis.set_xlabel("updates")
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
-        axis.legend()
+        if axis.lines:
+            axis.legend()
     figure.savefig(path, dpi=120, bbox_inches="tight")
     plt.close(figure)
 

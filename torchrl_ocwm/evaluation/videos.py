@@ -88,29 +88,39 @@ class OpenLoopFilm:
     Args:
         agent: The agent in training.
         dataset: Where the sequences are from.
+        folder: Where the videos go.
         sequences: How many.
         length: Frames of each, at most the shortest episode.
         context: Frames that the model sees.
 
-    Called without arguments; returns ``[T, 3, H, W]`` uint8.
+    Called with the number of updates; returns the file that it wrote.
     """
 
     def __init__(
-        self, agent: Agent, dataset: EpisodeDataset, *, sequences: int = 6, length: int = 50, context: int = 5
+        self,
+        agent: Agent,
+        dataset: EpisodeDataset,
+        folder: str | Path,
+        *,
+        sequences: int = 6,
+        length: int = 50,
+        context: int = 5,
     ) -> None:
-        self.agent, self.context = agent, context
+        self.agent, self.folder, self.context = agent, Path(folder), context
         lengths = torch.tensor(dataset.episode_lengths)
         length = min(length, int(lengths.min()))
         episodes = torch.linspace(0, len(lengths) - 1, sequences).long()
         starts = lengths.cumsum(0)[episodes] - lengths[episodes]
         self.records = dataset.records[starts[:, None] + torch.arange(length)].contiguous()
 
-    def __call__(self) -> Tensor:
+    def __call__(self, updates: int) -> Path:
         device = next(self.agent.parameters()).device
         predicted = open_loop_prediction(self.agent.model, self.records.to(device), self.context).cpu()
         truth = self.records["next", "pixels"]
         error = (predicted.int() - truth.int()).abs().to(torch.uint8)
-        return tile([truth, predicted, error])
+        file = self.folder / f"open_loop_{updates:07d}.mp4"
+        write_video(file, tile([truth, predicted, error]))
+        return file
 
 
 @torch.no_grad()

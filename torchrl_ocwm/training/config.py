@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -89,6 +90,8 @@ def to_dataclass(kind: type[T], config: DictConfig) -> T:
         ValueError: if a key is missing or not a field, or a value is refused.
     """
     values: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    real = [field.name for field in fields(kind) if field.type == "float"]  # type: ignore[arg-type]
+    values.update({name: float(values[name]) for name in real if name in values})
     try:
         return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
     except TypeError as error:

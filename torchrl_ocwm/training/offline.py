@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState
 from torchrl.trainers import LRSchedulerHook, Trainer
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
@@ -32,7 +31,7 @@ def train_offline(
     training: Training,
     *,
     evaluate: Callable[[int], dict[str, float]] | None = None,
-    film: Callable[[], Tensor] | None = None,
+    film: Callable[[int], Path] | None = None,
     progress: bool = True,
 ) -> Path:
     """Train an agent on a dataset; continue from the folder's checkpoint if it has one.
@@ -46,7 +45,7 @@ def train_offline(
         folder: Where checkpoint and logs go.
         training: The settings.
         evaluate: Called every ``eval_interval`` updates with their number; returns scores to log.
-        film: Called every ``video_interval`` updates; returns a video ``[T, 3, H, W]`` uint8 for the folder ``videos``.
+        film: Called every ``video_interval`` updates with their number; returns the file of a video that it wrote.
         progress: Show a progress bar.
 
     Returns:
@@ -77,7 +76,7 @@ def train_offline(
     if evaluate is not None:
         Every(trainer, training.eval_interval, evaluate)
     if film is not None:
-        Every(trainer, training.video_interval, lambda updates: _show(film(), updates, folder, loggers))
+        Every(trainer, training.video_interval, lambda updates: loggers.log_video("open_loop", film(updates), updates))
     if any(stepper.resolve(torch.device(training.device))):
         stepper.warmup(sample())
     if file.exists():
@@ -136,14 +135,6 @@ class RunCheckpoint(Checkpoint):
             kept = f"the checkpoint before it is kept at {path}" if Path(path).exists() else "there was none before it"
             reason = getattr(error, "strerror", None) or error
             raise CheckpointError(f"cannot write the checkpoint {path} ({reason}); {kept}") from error
-
-
-def _show(video: Tensor, updates: int, folder: Path, loggers: Loggers) -> None:
-    from torchrl_ocwm.evaluation.videos import write_video
-
-    file = folder / "videos" / f"open_loop_{updates:07d}.mp4"
-    write_video(file, video)
-    loggers.log_video("open_loop", file, step=updates)
 
 
 def _check_task(agent: Agent, dataset: EpisodeDataset) -> None:

@@ -1,0 +1,56 @@
+# `make demo` shows what this is; `make test` checks it. Both set up everything they need, once.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+DEMO := outputs/demo
+# Updates of the demonstration; with 50,000 steps of data they fit in 15 minutes on two cores.
+UPDATES ?= 1500
+STEPS ?= 50000
+WORKERS := 2
+
+export MUJOCO_GL ?= egl
+
+.PHONY: demo test check clean
+.DELETE_ON_ERROR:
+
+demo: check $(DEMO)/evaluation/.done
+	@echo
+	@cat $(DEMO)/evaluation/results.md
+	@echo
+	@echo "Where to look, all in $(DEMO):"
+	@echo "  evaluation/results.md, results.json   table and numbers, goal by goal"
+	@echo "  evaluation/heatmap.png                score over the workspace, beside random actions"
+	@echo "  evaluation/learning_curve.png         scores and losses while it learnt"
+	@echo "  evaluation/episodes.mp4               above: what happened; below: what the agent imagined from frame one"
+	@echo "  dreamer_pcp/videos/                   open-loop predictions: truth, model, error"
+
+test: check
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q
+
+check: $(INSTALLED)
+	@$(BIN)/python -m torchrl_ocwm.check
+
+clean:
+	rm -rf $(VENV) $(DEMO)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	@touch $@
+
+$(DEMO)/dataset/.done:
+	$(BIN)/python examples/collect.py env=reacher steps=$(STEPS) workers=$(WORKERS) dataset=$(@D)
+	@touch $@
+
+$(DEMO)/dreamer_pcp/.done: $(DEMO)/dataset/.done
+	$(BIN)/python examples/train_offline.py agent=dreamer_pcp env=reacher size=cpu \
+		dataset=$(<D) output=$(@D) training.updates=$(UPDATES) training.eval_interval=250 training.video_interval=500
+	@touch $@
+
+$(DEMO)/evaluation/.done: $(DEMO)/dreamer_pcp/.done
+	$(BIN)/python examples/evaluate.py checkpoint=$(<D)/checkpoint.zip goals=100 output=$(@D)
+	@touch $@

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torchrl_ocwm
+
+
+def requirements(name: str, seen: set[str]) -> set[str]:
+    """Distributions that one needs, itself included, without its extras."""
+    if name in seen:
+        return seen
+    try:
+        needed = importlib.metadata.requires(name) or []
+    except importlib.metadata.PackageNotFoundError:
+        return seen
+    seen.add(name)
+    for line in needed:
+        if "extra ==" not in line:
+            requirements(re.split(r"[^A-Za-z0-9_.-]", line, maxsplit=1)[0].lower(), seen)
+    return seen
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder to import from that holds torch, tensordict, torchrl, what these need, and this package."""
+    folder = tmp_path_factory.mktemp("bare")
+    for name in {*requirements("torch", set()), *requirements("tensordict", set()), *requirements("torchrl", set())}:
+        distribution = importlib.metadata.distribution(name)
+        for top in {Path(str(file)).parts[0] for file in distribution.files or []} - {"..", "__pycache__"}:
+            target = Path(str(distribution.locate_file(top)))
+            if target.exists() and not (folder / top).exists():
+                (folder / top).symlink_to(target)
+    (folder / "torchrl_ocwm").symlink_to(Path(torchrl_ocwm.__file__).parent)
+    return folder
+
+
+def run(bare: Path, code: str) -> subprocess.CompletedProcess[str]:
+    """Run code in an interpreter that sees the standard library and one folder."""
+    path = [one for one in sys.path if one and "site-packages" not in one and Path(one).name != "main"]
+    start = f"import sys; sys.path[:] = {[*path, str(bare)]!r}; "
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    return subprocess.run(
+        [sys.executable, "-I", "-S", "-c", start + code], capture_output=True, text=True, env=environment, check=False
+    )
+
+
+@pytest.mark.parametrize("module", ["torchrl_ocwm", "torchrl_ocwm.modules", "torchrl_ocwm.objectives"])
+def test_imports_with_torch_tensordict_and_torchrl_alone(bare: Path, module: str) -> None:
+    blocked = (
+        "import importlib.util as u; assert not any(map(u.find_spec, ('gymnasium', 'mujoco', 'matplotlib', 'hydra')))"
+    )
+    done = run(bare, f"{blocked}; import {module}")
+    assert done.returncode == 0, done.stderr
+
+
+def test_an_agent_learns_with_torch_tensordict_and_torchrl_alone(bare: Path) -> None:
+    code = (
+        "from torchrl_ocwm import build_agent; from torchrl_ocwm.testing import random_records, reacher_task; "
+        "task = reacher_task(); losses = build_agent('dreamer_pcp', task, 'debug').loss(random_records(task, 2, 3)); "
+        "print(sorted(losses.keys())[:2])"
+    )
+    assert "loss_actor" in run(bare, code).stdout
+
+
+def test_a_missing_simulator_is_named(bare: Path) -> None:
+    done = run(bare, "from torchrl_ocwm import make_env; make_env('reacher')")
+    assert "pip install 'torchrl-ocwm[dm-control]'" in done.stderr.splitlines()[-1]
+
+
+def test_check_says_what_to_install() -> None:
+    """OSMesa's library is replaced by a name that does not exist."""
+    code = (
+        "import ctypes.util; ctypes.util.find_library = lambda name: None; "
+        "import runpy; runpy.run_module('torchrl_ocwm.check', run_name='__main__')"
+    )
+    environment = {**os.environ, "MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "osmesa"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 1
+    (line,) = done.stderr.strip().splitlines()
+    assert "apt-get install libosmesa6" in line
+
+
+def test_check_finds_the_renderer() -> None:
+    done = subprocess.run([sys.executable, "-m", "torchrl_ocwm.check"], capture_output=True, text=True, check=False)
+    assert done.stdout == "reacher: simulates and renders\n", done.stderr
+
+
+def test_unknown_attribute() -> None:
+    with pytest.raises(AttributeError, match="has no attribute 'no_such_thing'"):
+        torchrl_ocwm.no_such_thing
