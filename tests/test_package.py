@@ -95,4 +95,4 @@ def test_check_finds_the_renderer() -> None:
 
 def test_unknown_attribute() -> None:
     with pytest.raises(AttributeError, match="has no attribute 'no_such_thing'"):
-        torchrl_ocwm.no_such_thing
+        _ = torchrl_ocwm.no_such_thing

@@ -132,8 +132,8 @@ class Agent(nn.Module):
         reward = REWARDS[config.reward](self.model)
         if (GOAL in reward.in_keys) != bool(goal_features):
             raise ValueError(
-                f"reward={config.reward!r} does not go with goal={config.goal!r}: an imagined reward has to judge by the "
-                "goal that the policy sees, and by no other"
+                f"reward={config.reward!r} does not go with goal={config.goal!r}: an imagined reward has to judge by "
+                "the goal that the policy sees, and by no other"
             )
         self.goal_encoder = goal_encoder
         self.actor = self._make_actor(goal_features)

@@ -1,7 +1,7 @@
 """The networks of a world model, all of them TorchRL's parts, in two styles.
 
-``"dreamer_v3"``: RMS normalisation, SiLU, a block GRU. ``"dreamer_v2"``: no normalisation, MLPs with ELU, a plain GRU, the
-CNN of the first Dreamers: as near to the paper's networks as TorchRL's parts come.
+``"dreamer_v3"``: RMS normalisation, SiLU, a block GRU. ``"dreamer_v2"``: no normalisation, MLPs with ELU, a plain GRU,
+the CNN of the first Dreamers: as near to the paper's networks as TorchRL's parts come.
 """
 
 from __future__ import annotations
