@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_ocwm.agents import build_agent
+from torchrl_ocwm.envs import Task, make_task
+from torchrl_ocwm.evaluation import EvaluationEnvs, LandmarkEvaluation, ReconstructionError
+from torchrl_ocwm.testing import reacher_task
+
+
+def still(tensordict: TensorDictBase) -> TensorDictBase:
+    return tensordict.set("action", torch.zeros(*tensordict.batch_size, 2))
+
+
+def push(tensordict: TensorDictBase) -> TensorDictBase:
+    return tensordict.set("action", torch.ones(*tensordict.batch_size, 2))
+
+
+@pytest.fixture(scope="module")
+def task() -> Task:
+    return make_task("reacher")
+
+
+@pytest.fixture(scope="module")
+def envs(task: Task) -> Iterator[EvaluationEnvs]:
+    with EvaluationEnvs(task, episode_steps=5, workers=0, envs=4) as envs:
+        yield envs
+
+
+def goals(task: Task, number: int) -> Tensor:
+    return task.workspace.grid(4).flatten(0, 1)[:number]
+
+
+@pytest.mark.parametrize("number", [1, 4, 6])
+def test_one_episode_per_goal(envs: EvaluationEnvs, task: Task, number: int) -> None:
+    episodes = envs.run(push, goals(task, number))
+    assert episodes.shape == (number, 5)
+    torch.testing.assert_close(episodes["goal_position"], goals(task, number).unsqueeze(1).expand(-1, 5, -1))
+    distance = (episodes["object_position"][:, :, 0] - episodes["goal_position"]).norm(dim=-1, keepdim=True)
+    torch.testing.assert_close(episodes["reward"], -distance)
+
+
+def test_seed_decides(envs: EvaluationEnvs, task: Task) -> None:
+    first, second, other = (envs.run(push, goals(task, 6), seed=seed) for seed in (3, 3, 4))
+    torch.testing.assert_close(first["object_position_true"], second["object_position_true"], rtol=0, atol=0)
+    assert not torch.equal(first["object_position_true"], other["object_position_true"])
+
+
+def test_episodes_move_with_the_policy(envs: EvaluationEnvs, task: Task) -> None:
+    def travelled(policy: Any) -> float:
+        position = envs.run(policy, goals(task, 4))["object_position_true"][:, :, 0]
+        return float((position[:, -1] - position[:, 0]).norm(dim=-1).mean())
+
+    assert travelled(still) < 1e-6
+    assert travelled(push) > 1e-3
+
+
+def test_processes_change_nothing(task: Task, envs: EvaluationEnvs) -> None:
+    """Which process an environment runs in does not matter to where its episode goes."""
+    with EvaluationEnvs(task, episode_steps=5, workers=2, envs=2) as parallel:
+        episodes = parallel.run(push, goals(task, 4), keep=("pixels",))
+    assert episodes["pixels"].shape == (4, 5, 3, 64, 64)
+    torch.testing.assert_close(episodes["goal_position"][:, 0], goals(task, 4))
+    assert episodes["object_position_true"].isfinite().all()
+
+
+def test_goals_are_checked(envs: EvaluationEnvs) -> None:
+    with pytest.raises(ValueError, match="lies outside the workspace"):
+        envs.run(still, torch.tensor([[0.5, 0.0]]))
+    with pytest.raises(ValueError, match="has 2 coordinates"):
+        envs.run(still, torch.zeros(3, 3))
+
+
+def test_reconstruction_error_by_hand(make_agent: Any) -> None:
+    agent = make_agent("dreamer")
+    decoders = agent.model.vector_decoders
+    decoders["object_position"] = Constant([0.5, 0.0])  # units of 0.24 m
+    decoders["goal_position"] = Constant([0.0, 1.0])
+    latent = TensorDict({"state": torch.zeros(3, agent.model.state), "belief": torch.zeros(3, agent.model.belief)}, [3])
+    step = TensorDict(
+        {
+            "latent": latent,
+            "object_position_true": torch.tensor([[[0.12, 0.05]]]).expand(3, 1, 2),
+            "goal_position": torch.tensor([[0.1, 0.24]]).expand(3, 2),
+        },
+        [3],
+    )
+    errors = ReconstructionError(agent)(step)
+    torch.testing.assert_close(errors["entity_error"], torch.full((3,), 0.05))
+    torch.testing.assert_close(errors["goal_error"], torch.full((3,), 0.1))
+    assert "goal_error" not in ReconstructionError(make_agent("dreamer_pcp"))(step)
+
+
+class Constant(torch.nn.Module):
+    def __init__(self, value: list[float]) -> None:
+        super().__init__()
+        self.value = torch.tensor(value)
+
+    def forward(self, state: Tensor, belief: Tensor) -> Tensor:
+        return self.value.expand(*state.shape[:-1], -1)
+
+
+def test_landmarks(task: Task) -> None:
+    agent = build_agent("dreamer_pcp", task, "debug")
+    scores = LandmarkEvaluation(agent, episodes=2, episode_steps=3)(0)
+    assert set(scores) == {f"evaluation/{name}" for name in ("final_score", "mean_score", "success", "final_distance")}
+    assert 0 < scores["evaluation/final_score"] < 1
+    with pytest.raises(ValueError, match="11 evaluation episodes, but reacher has 10 landmarks"):
+        LandmarkEvaluation(agent, episodes=11, episode_steps=3)(0)
+
+
+def test_the_test_task_is_reachers(task: Task) -> None:
+    """What tests and doctests use without a simulator has the simulator's shapes."""
+    workspace = replace(task.workspace, landmarks=reacher_task().workspace.landmarks, reach=(0.042, 0.24))
+    assert replace(task, workspace=workspace) == reacher_task()
+    assert task.workspace.reach == pytest.approx((0.042, 0.24), abs=1e-3)

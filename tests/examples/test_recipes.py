@@ -1,0 +1,91 @@
+"""Tiny versions of the recipes, as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torchrl_ocwm
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def run(script: str, *arguments: str, fails: bool = False) -> str:
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / script), *arguments], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode != 0) == fails, done.stderr
+    return done.stderr if fails else done.stdout
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "reacher"
+    out = run("collect.py", f"dataset={path}", "steps=120", "env.options.horizon=30", "workers=1")
+    assert "120 steps in 4 episodes" in out
+    return path
+
+
+def train(dataset: Path, output: Path, *arguments: str) -> Path:
+    settings = ["updates=4", "log_interval=2", "eval_interval=2", "eval_episodes=2", "eval_steps=3", "video_interval=4"]
+    run(
+        "train_offline.py",
+        f"dataset={dataset}",
+        f"output={output}",
+        "size=debug",
+        *(f"training.{setting}" for setting in settings),
+        *arguments,
+    )
+    return output / "checkpoint.zip"
+
+
+def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
+    files = [train(dataset, tmp_path / "pcp", "agent=dreamer_pcp", "training.loggers=[tensorboard]")]
+    for seed in (0, 1):
+        files.append(train(dataset, tmp_path / f"dreamer_{seed}", "agent=dreamer", f"training.seed={seed}"))
+    assert (tmp_path / "pcp" / "videos" / "open_loop_0000004.mp4").stat().st_size > 1000
+    assert list((tmp_path / "pcp" / "tensorboard").iterdir())
+    assert (tmp_path / "pcp" / ".hydra" / "config.yaml").exists()
+    checkpoints = ",".join(map(str, files))
+    output = tmp_path / "evaluation"
+    printed = run(
+        "evaluate.py",
+        f"checkpoint=[{checkpoints}]",
+        "goals=4",
+        "episode_steps=3",
+        "workers=0",
+        "envs=4",
+        "video_goals=2",
+        f"output={output}",
+    )
+    table = (output / "results.md").read_text()
+    assert table in printed
+    rows = [line.split(" | ") for line in table.splitlines()[2:]]
+    assert [row[0] for row in rows] == ["| random", "| dreamer_pcp", "| dreamer"]
+    assert [row[1] for row in rows] == ["1", "1", "2"]
+    assert rows[1][-1].startswith("–")  # PCP's world model does not know the goal
+    assert "±" in rows[2][-1]
+    results = json.loads((output / "results.json").read_text())
+    assert len(results["agents"]["dreamer"]["per_goal"][0]["final_score"]) == 4
+    for name in ("heatmap.png", "learning_curve.png", "episodes.mp4"):
+        assert (output / name).stat().st_size > 1000, name
+    assert torchrl_ocwm.load_agent(files[0]).agent.config.goal == "position"
+
+
+@pytest.mark.parametrize(
+    ("script", "arguments", "message"),
+    [
+        ("train_offline.py", ("agent=focus",), "dreamer_pcp"),
+        ("train_offline.py", ("dataset=/nowhere",), "DatasetError: /nowhere/dataset.json: no such file"),
+        ("collect.py", ("steps=0",), "ValueError: steps and workers must be at least 1"),
+        ("evaluate.py", ("checkpoint=/nowhere.zip",), "CheckpointError: /nowhere.zip: no such checkpoint"),
+    ],
+)
+def test_errors_are_one_message(script: str, arguments: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    error = run(script, *arguments, *([f"output={tmp_path}"] if script != "collect.py" else []), fails=True)
+    assert message in error
+    assert "Traceback" not in error

@@ -1,0 +1,54 @@
+"""One update on a GPU: compiled, captured in a CUDA graph, in bfloat16."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_ocwm.agents import SIZES, build_agent
+from torchrl_ocwm.testing import random_records, reacher_task
+from torchrl_ocwm.training.settings import Training
+from torchrl_ocwm.training.stepper import make_stepper
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+]
+
+
+def losses(name: str, updates: int = 3, **settings: Any) -> list[TensorDict]:
+    """Losses of the first updates of a debug agent on one batch."""
+    torch.manual_seed(0)
+    agent = build_agent(name, reacher_task(), replace(SIZES["debug"], batch_size=4)).cuda()
+    batch = random_records(reacher_task(), 4, 8).cuda()
+    stepper = make_stepper(agent, Training(device="cuda", **settings))
+    if any(stepper.resolve(torch.device("cuda"))):
+        stepper.warmup(batch)
+    return [stepper.step(None, batch.clone()).clone() for _ in range(updates)]
+
+
+def world_model_losses(steps: list[TensorDict]) -> torch.Tensor:
+    names = ("loss_model_pixels", "loss_model_object_position", "loss_model_dynamic")
+    return torch.stack([step[name].float() for step in steps for name in names])
+
+
+@pytest.mark.parametrize("name", ["dreamer", "dreamer_pcp"])
+@pytest.mark.parametrize(("compiled", "captured"), [(True, False), (False, True), (True, True)])
+def test_compiled_and_captured_updates_are_close_to_eager(name: str, compiled: bool, captured: bool) -> None:
+    eager = world_model_losses(losses(name, compile=False, cudagraph=False))
+    fast = world_model_losses(losses(name, compile=compiled, cudagraph=captured))
+    # The noise differs, so that sampled states do; the size of the losses does not.
+    torch.testing.assert_close(fast, eager, rtol=0.05, atol=0.05)
+
+
+@pytest.mark.parametrize("name", ["dreamer", "dreamer_pcp"])
+def test_bfloat16_is_finite_and_close(name: str) -> None:
+    single = losses(name, compile=False, cudagraph=False)
+    half = losses(name, compile=False, cudagraph=False, mixed_precision=True)
+    for step in half:
+        assert all(value.isfinite().all() for key, value in step.items() if key.startswith("loss_"))
+    torch.testing.assert_close(world_model_losses(half), world_model_losses(single), rtol=0.05, atol=0.05)
