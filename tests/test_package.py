@@ -44,8 +44,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(bare: Path, code: str) -> subprocess.CompletedProcess[str]:
     """Run code in an interpreter that sees the standard library and one folder."""
-    path = [one for one in sys.path if one and "site-packages" not in one and Path(one).name != "main"]
-    start = f"import sys; sys.path[:] = {[*path, str(bare)]!r}; "
+    start = f"import sys; sys.path.append({str(bare)!r}); "
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     return subprocess.run(
         [sys.executable, "-I", "-S", "-c", start + code], capture_output=True, text=True, env=environment, check=False
@@ -65,9 +64,9 @@ def test_an_agent_learns_with_torch_tensordict_and_torchrl_alone(bare: Path) -> 
     code = (
         "from torchrl_ocwm import build_agent; from torchrl_ocwm.testing import random_records, reacher_task; "
         "task = reacher_task(); losses = build_agent('dreamer_pcp', task, 'debug').loss(random_records(task, 2, 3)); "
-        "print(sorted(losses.keys())[:2])"
+        "print(losses['loss_actor'].isfinite())"
     )
-    assert "loss_actor" in run(bare, code).stdout
+    assert "tensor(True)" in run(bare, code).stdout
 
 
 def test_a_missing_simulator_is_named(bare: Path) -> None:
