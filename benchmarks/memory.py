@@ -10,6 +10,7 @@ them. Needs about 20 kB of disk per step for as long as it runs; a folder that i
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import signal
@@ -100,7 +101,9 @@ def watch(script: str, dataset: Path, *overrides: str) -> list[Sample]:
             time.sleep(INTERVAL)
     finally:
         if process.poll() is None:
-            process.send_signal(signal.SIGINT)  # as Ctrl-C: it ends its workers
+            for one in process_tree(process.pid):
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(one, signal.SIGKILL)
             process.wait()
     if process.returncode:
         sys.exit(f"{script} failed with exit code {process.returncode}")

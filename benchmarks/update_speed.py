@@ -22,23 +22,11 @@ from tensordict import TensorDictBase
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
 from torchrl_ocwm.data import EpisodeDataset, RelabelGoals, make_replay_buffer
 from torchrl_ocwm.envs import Task
-from torchrl_ocwm.testing import random_records, reacher_task
+from torchrl_ocwm.testing import random_dataset, reacher_task
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_stepper
 
-EPISODES, EPISODE_STEPS = 40, 500
-
-
-def random_dataset(folder: str) -> EpisodeDataset:
-    """A dataset with the shapes of Reacher and random values."""
-    task = reacher_task()
-    dataset = EpisodeDataset.create(
-        folder, example=random_records(task, 1, 1)[0, 0], metadata={"environment": "reacher", "task": task.to_dict()}
-    )
-    for seed in range(EPISODES):
-        dataset.append(random_records(task, 1, EPISODE_STEPS + 1, seed=seed)[0])
-    dataset.trim()
-    return dataset
+EPISODES, LENGTH = 40, 501
 
 
 def make_sampler(agent: Agent, dataset: EpisodeDataset, device: str) -> Callable[[], TensorDictBase]:
@@ -110,7 +98,11 @@ def main() -> None:
     torch.manual_seed(0)
 
     with tempfile.TemporaryDirectory() as folder:
-        dataset = EpisodeDataset.open(arguments.dataset) if arguments.dataset else random_dataset(folder)
+        dataset = (
+            EpisodeDataset.open(arguments.dataset)
+            if arguments.dataset
+            else random_dataset(f"{folder}/data", reacher_task(), episodes=EPISODES, length=LENGTH)
+        )
         sampling, stepping = measure(dataset, arguments)
 
     whole = [sum(parts) for parts in zip(sampling, stepping, strict=True)]

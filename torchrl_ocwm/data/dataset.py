@@ -101,6 +101,7 @@ class EpisodeDataset:
             _check_size(path / _FRAMES / f"{name}.memmap", torch.Size([index["records"], *shape]), _dtype(dtype))
         dataset = cls(path, index)
         dataset._check_episodes()
+        release_pages(dataset._frames)
         return dataset
 
     @property
