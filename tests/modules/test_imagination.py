@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -7,7 +8,8 @@ import torch
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_ocwm.agents import Agent
+from torchrl_ocwm.agents import SIZES, Agent, build_agent
+from torchrl_ocwm.testing import reacher_task
 
 
 @pytest.fixture
@@ -39,7 +41,9 @@ def test_an_ordinary_rollout_works_too(agent: Agent) -> None:
     assert rollout["next", "latent", "goal"].shape == (3, 2)
 
 
-def test_actions_beyond_the_bounds_count_as_clipped(agent: Agent) -> None:
+@pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
+def test_actions_beyond_the_bounds_count_as_clipped(style: Any) -> None:
+    agent = build_agent("dreamer_pcp", reacher_task(), replace(SIZES["debug"], style=style))
     start = agent.imagination.reset().expand(4).clone()
     wild = start.clone().set("action", torch.tensor([[5.0, -3.0]]).expand(4, 2))
     clipped = start.clone().set("action", torch.tensor([[1.0, -1.0]]).expand(4, 2))

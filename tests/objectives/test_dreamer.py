@@ -144,7 +144,9 @@ def test_imagined_reward_teaches_the_actor_through_the_dynamics(make_agent: Any,
 def test_every_imagined_start_has_a_goal_of_its_own(make_agent: Any, records: TensorDict) -> None:
     agent = make_agent()
     latent = agent.model.records()(records)["next"].select("state", "belief")
-    goals = agent.loss.imagination_start(latent)["latent", "goal"]
+    start = agent.loss.imagination_start(latent)
+    assert not any(value.requires_grad for value in start.values(True, True))
+    goals = start["latent", "goal"]
     assert goals.shape == (12, 2)
     assert len(goals.unique(dim=0)) == 12
     assert goals.abs().max() <= 1

@@ -26,8 +26,8 @@ def mean_and_error(values: Tensor) -> tuple[float, float | None]:
     """Mean over seeds and its standard error; no error for a single seed.
 
     Examples:
-        >>> mean_and_error(torch.tensor([0.7, 0.9]))
-        (0.800..., 0.1000...)
+        >>> mean_and_error(torch.tensor([0.5, 1.0]))
+        (0.75, 0.25)
     """
     mean = float(values.double().mean())
     if len(values) < 2:

@@ -21,6 +21,7 @@ def position_distance(position: Tensor, goal: Tensor, epsilon: float = 1e-6) -> 
         ``[..., 1]``, in the unit of the arguments.
 
     Examples:
+        >>> import torch
         >>> position_distance(torch.tensor([3.0, 4.0]), torch.zeros(2))
         tensor([-5.])
     """
@@ -59,6 +60,7 @@ class PositionDistanceReward(TensorDictModule):
         reward_key: Key written, ``[..., 1]`` metres.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> reward = PositionDistanceReward(WorkspaceUnits((-0.2, -0.2), (0.2, 0.2)))
         >>> data = TensorDict({"object_units": torch.tensor([[0.0, 0.5]]), "latent": {"goal": torch.zeros(1, 2)}}, [1])

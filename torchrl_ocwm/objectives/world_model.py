@@ -21,6 +21,7 @@ def image_reconstruction(prediction: Tensor, target: Tensor) -> Tensor:
         target: ``[*batch, C, H, W]`` uint8, or float in [0, 1].
 
     Examples:
+        >>> import torch
         >>> image_reconstruction(torch.ones(2, 1, 2, 2), torch.zeros(2, 1, 2, 2, dtype=torch.uint8))
         tensor(4.)
     """
@@ -37,6 +38,7 @@ def symlog_reconstruction(prediction: Tensor, target: Tensor) -> Tensor:
         target: ``[*batch, N]``.
 
     Examples:
+        >>> import torch
         >>> symlog_reconstruction(torch.zeros(2, 3), torch.full((2, 3), torch.e - 1))
         tensor(3.)
     """
