@@ -38,7 +38,7 @@ class Loggers:
             if type(logger).__name__ == "WandbLogger":
                 import wandb
 
-                logger.experiment.log({name: wandb.Video(str(file))}, step=step)
+                logger.log_metrics({name: wandb.Video(str(file))}, step=step)
 
 
 def make_loggers(folder: Path, also: tuple[str, ...] = (), *, name: str = "run") -> Loggers:
