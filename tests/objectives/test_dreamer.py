@@ -181,6 +181,22 @@ def test_replay_value_needs_recorded_rewards(make_agent: Any) -> None:
         )
 
 
+def test_set_keys_nested(make_agent: Any, records: TensorDict) -> None:
+    """The world model may write its latents anywhere."""
+    loss = make_agent().loss
+    torch.manual_seed(1)
+    expected = loss(records)
+    agent = make_agent()
+    move = TensorDictModule(
+        lambda s, b: (s, b), [("next", "state"), ("next", "belief")], [("next", "my", "s"), ("next", "my", "b")]
+    )
+    spoil = TensorDictModule(torch.zeros_like, [("next", "state")], [("next", "state")])
+    agent.loss.model_loss.world_model = TensorDictSequential(agent.loss.model_loss.world_model, move, spoil)
+    agent.loss.set_keys(state=("my", "s"), belief=("my", "b"))
+    torch.manual_seed(1)
+    torch.testing.assert_close(total(agent.loss(records)), total(expected))
+
+
 def test_in_keys_suffice(make_agent: Any, records: TensorDict) -> None:
     loss = make_agent("dreamer").loss
     torch.manual_seed(1)

@@ -50,6 +50,7 @@ class SmoothRandomPolicy(TensorDictModuleBase):
         self.in_keys, self.out_keys = [init_key], [action_key, ("exploration", "noise"), ("exploration", "memory")]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the next action."""
         start = tensordict.get(self.in_keys[0])
         fresh = torch.randn(*tensordict.batch_size, self.action_dim, device=start.device)
         ratio = torch.rand(*tensordict.batch_size, 1, device=start.device)

@@ -42,6 +42,7 @@ class RelabelGoals(Transform):
         self.workspace, self.goals, self.object_index = workspace, goals, object_index
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write goals and rewards into a batch ``[B, T]``."""
         position = tensordict["next", "object_position"][..., self.object_index, :]
         if self.goals == "uniform":
             goal = self.workspace.sample(position.shape[:-2]).to(position).unsqueeze(-2).expand_as(position)

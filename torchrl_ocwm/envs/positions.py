@@ -229,6 +229,7 @@ class MaskToPosition(Transform):
         return tensordict.set(self.out_keys[1], visible)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write positions and visibility of one frame or a batch; a hidden object gets a position of zero."""
         position, visible = self._estimate(tensordict)
         if tensordict.ndim:
             time = tensordict.ndim - 1

@@ -29,6 +29,7 @@ class ActingLatent(TensorDictModuleBase):
         self.out_keys = [("latent", name) for name in self.sizes]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write zeros where there is no latent yet."""
         start = tensordict.get("is_init", None)
         if start is None:
             raise KeyError(

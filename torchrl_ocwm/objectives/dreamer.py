@@ -15,7 +15,8 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
     World model, actor and critic in one loss. Imagination starts from every posterior state of the batch, each with a
     goal of its own, which ``goal_source`` writes. Without a goal source it computes what ``DreamerV3Loss`` computes.
 
-    State, belief and goal travel in one nested entry, ``latent`` (:class:`~torchrl_ocwm.modules.ImaginationEnv`).
+    State, belief and goal travel in one nested entry, ``latent`` (:class:`~torchrl_ocwm.modules.ImaginationEnv`),
+    wherever the world model writes the first two (the keys ``state`` and ``belief``, under ``next``).
     No gradient of actor or critic reaches the world model, and none of any reaches the goal source.
 
     Args:
@@ -79,8 +80,13 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
         return list(dict.fromkeys(keys))
 
     def forward(self, sample: TensorDictBase) -> TensorDictBase:
+        """Losses and metrics of records ``[B, T]``, scalars, and the detached latents under ``replay_context``."""
         model_losses, records = self.model_loss(sample)
-        latent = records.get("next").select(self.tensor_keys.state, self.tensor_keys.belief)
+        after = records.get("next")
+        latent = TensorDict(
+            {"state": after.get(self.tensor_keys.state), "belief": after.get(self.tensor_keys.belief)},
+            sample.batch_size,
+        )
         actor_losses, imagined = self.actor_loss(self.imagination_start(latent))
         value_losses, _ = self.value_loss(imagined.detach())
         losses = model_losses.update(actor_losses).update(value_losses)

@@ -150,6 +150,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
         self.lambda_goal_position = lambda_goal_position
 
     def forward(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """Losses of records ``[B, T]``, scalars, and the records with the predictions."""
         missing = [key for key in self.world_model.in_keys if tensordict.get(key, None) is None]
         if missing:
             raise KeyError(
