@@ -229,7 +229,7 @@ class MaskToPosition(Transform):
         return tensordict.set(self.out_keys[1], visible)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write positions and visibility of one frame or a batch; a hidden object gets a position of zero."""
+        """Write positions and visibility of a frame, or of sequences ``[..., T]``, where a hidden object stays put."""
         position, visible = self._estimate(tensordict)
         if tensordict.ndim:
             time = tensordict.ndim - 1

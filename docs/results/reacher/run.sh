@@ -1,21 +1,29 @@
 #!/usr/bin/env bash
-# The comparison of docs/results/reacher: the same data, the same number of updates, two seeds each.
+# The comparison of docs/results/reacher: the same data, the same number of updates.
 # Two runs at a time, one thread each. Run from the repository root; what is done already is not done again.
 set -eu
 export MUJOCO_GL=${MUJOCO_GL:-egl} LP_NUM_THREADS=0
+here=docs/results/reacher runs=outputs/reacher
 python examples/collect.py env=reacher steps=100000 seed=0 dataset=data/reacher
 
-train() {
-  for seed in 0 1; do
-    python examples/train_offline.py "$@" env=reacher size=cpu dataset=data/reacher \
-      training.updates=8000 training.threads=1 training.seed=$seed
-  done
+train() {  # folder, seed, further settings
+  python examples/train_offline.py "${@:3}" env=reacher size=cpu dataset=data/reacher output="$runs/$1/cpu/seed_$2" \
+    training.updates=8000 training.threads=1 training.seed="$2"
 }
-train agent=dreamer_pcp &
-train agent=dreamer &
+{ train dreamer_pcp 0 agent=dreamer_pcp; train dreamer_pcp 1 agent=dreamer_pcp; } &
+{ train dreamer 0 agent=dreamer; train dreamer 1 agent=dreamer; } &
 wait
+# The paper's first remedy: weigh the goal in the world model's loss. One seed.
+train dreamer_goal_200 0 agent=dreamer agent.lambda_goal_position=200
 
-runs=outputs/reacher
-python examples/evaluate.py goals=100 output=docs/results/reacher "checkpoint=[\
-$runs/dreamer/cpu/seed_0/checkpoint.zip,$runs/dreamer/cpu/seed_1/checkpoint.zip,\
-$runs/dreamer_pcp/cpu/seed_0/checkpoint.zip,$runs/dreamer_pcp/cpu/seed_1/checkpoint.zip]"
+checkpoints=()
+: > "$here/wall_time.txt"
+for run in dreamer/cpu/seed_0 dreamer/cpu/seed_1 dreamer_goal_200/cpu/seed_0 dreamer_pcp/cpu/seed_0 dreamer_pcp/cpu/seed_1; do
+  file=$runs/$run/checkpoint.zip
+  checkpoints+=("$file")
+  name=${run//\/cpu\//_}
+  cp "$runs/$run/.hydra/config.yaml" "$here/$name.yaml"
+  cp "$runs/$run/log/scalars/evaluation/final_score.csv" "$here/$name.csv"
+  echo "$name $(($(stat -c %Y "$file") - $(stat -c %Y "$runs/$run/.hydra/config.yaml"))) s" >> "$here/wall_time.txt"
+done
+python examples/evaluate.py goals=100 output=$here "checkpoint=[$(IFS=,; echo "${checkpoints[*]}")]"
