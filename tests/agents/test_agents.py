@@ -43,6 +43,8 @@ def test_who_sees_the_goal() -> None:
         (replace(PCP, reward="head"), "reward='head' does not go with goal='position'"),
         (AgentConfig(reward="position_distance"), "reward='position_distance' does not go with goal='none'"),
         (replace(PCP, observed=("proprio",)), "does not decode object positions"),
+        (replace(PCP, goal="object_latent"), "need world_model='object'"),
+        (replace(AGENTS["focus_lcp"], observed=("proprio",)), "'object_position' in `observed`"),
     ],
 )
 def test_choices_that_do_not_fit(config: AgentConfig, message: str) -> None:
@@ -51,8 +53,8 @@ def test_choices_that_do_not_fit(config: AgentConfig, message: str) -> None:
 
 
 def test_unknown_names_list_the_valid_ones() -> None:
-    with pytest.raises(ValueError, match="unknown agent 'focus'; there are dreamer, dreamer_pcp"):
-        build_agent("focus", reacher_task())
+    with pytest.raises(ValueError, match="unknown agent 'muzero'; there are dreamer, dreamer_pcp, focus"):
+        build_agent("muzero", reacher_task())
     with pytest.raises(ValueError, match="unknown size 'huge'; there are debug, cpu, small, paper, large"):
         build_agent("dreamer", reacher_task(), "huge")
 

@@ -45,6 +45,7 @@ def train(dataset: Path, output: Path, *arguments: str) -> Path:
 
 def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     files = [train(dataset, tmp_path / "pcp", "agent=dreamer_pcp", "training.loggers=[tensorboard]")]
+    files.append(train(dataset, tmp_path / "lcp", "agent=focus_lcp"))
     for seed in (0, 1):
         files.append(train(dataset, tmp_path / f"dreamer_{seed}", "agent=dreamer", f"training.seed={seed}"))
     assert (tmp_path / "pcp" / "videos" / "open_loop_0000004.mp4").stat().st_size > 1000
@@ -65,10 +66,10 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     table = (output / "results.md").read_text()
     assert table in printed
     rows = [line.split(" | ") for line in table.splitlines()[2:]]
-    assert [row[0] for row in rows] == ["| random", "| dreamer_pcp", "| dreamer"]
-    assert [row[1] for row in rows] == ["1", "1", "2"]
+    assert [row[0] for row in rows] == ["| random", "| dreamer_pcp", "| focus_lcp", "| dreamer"]
+    assert [row[1] for row in rows] == ["1", "1", "1", "2"]
     assert rows[1][-1].startswith("–")  # PCP's world model does not know the goal
-    assert "±" in rows[2][-1]
+    assert "±" in rows[3][-1]
     results = json.loads((output / "results.json").read_text())
     assert len(results["agents"]["dreamer"]["per_goal"][0]["final_score"]) == 4
     for name in ("heatmap.png", "learning_curve.png", "episodes.mp4"):
@@ -79,7 +80,7 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("script", "arguments", "message"),
     [
-        ("train_offline.py", ("agent=focus",), "dreamer_pcp"),
+        ("train_offline.py", ("agent=muzero",), "dreamer_pcp"),
         ("train_offline.py", ("dataset=/nowhere",), "DatasetError: /nowhere/dataset.json: no such file"),
         ("collect.py", ("steps=0",), "ValueError: steps and workers must be at least 1"),
         ("evaluate.py", ("checkpoint=/nowhere.zip",), "CheckpointError: /nowhere.zip: no such checkpoint"),

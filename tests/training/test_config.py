@@ -45,7 +45,7 @@ def test_whole_numbers_are_real_numbers_too() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("agent=foo", r"agent/foo[\s\S]*dreamer\s+dreamer_pcp"),
+        ("agent=foo", r"agent/foo[\s\S]*dreamer\s+dreamer_pcp\s+focus\s+focus_lcp\s+focus_pcp"),
         ("env=foo", r"env/foo[\s\S]*reacher"),
         ("size=foo", r"size/foo[\s\S]*cpu\s+debug\s+large\s+paper\s+small"),
         ("agnt=dreamer", "unknown key 'agnt'; valid here: agent, env, size, dataset, output, training"),

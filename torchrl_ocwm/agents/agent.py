@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from tensordict.nn import (
@@ -24,15 +25,26 @@ from torchrl_ocwm.modules import (
     Actor,
     FlatWorldModel,
     ImaginationEnv,
+    LatentPositionalEncoder,
+    LatentSimilarityReward,
+    ObjectWorldModel,
     PositionDistanceReward,
     UniformGoals,
     WorkspaceUnits,
+    WorldModel,
 )
 from torchrl_ocwm.modules.networks import make_mlp
-from torchrl_ocwm.objectives import GoalConditionedDreamerLoss, WorldModelLoss
+from torchrl_ocwm.objectives import FOCUSModelLoss, GoalConditionedDreamerLoss, WorldModelLoss
 
 LAMBDA = 0.95
 GOAL: NestedKey = ("latent", "goal")
+
+
+class WorldModelChoice(NamedTuple):
+    """How a world model is built, and the loss that trains it."""
+
+    build: Callable[[Task, AgentConfig, Size], WorldModel]
+    loss: type[WorldModelLoss]
 
 
 def flat_world_model(task: Task, config: AgentConfig, size: Size) -> FlatWorldModel:
@@ -49,37 +61,77 @@ def flat_world_model(task: Task, config: AgentConfig, size: Size) -> FlatWorldMo
     )
 
 
-def position_goal(model: FlatWorldModel) -> tuple[int, TensorDictModuleBase]:
+def object_world_model(task: Task, config: AgentConfig, size: Size) -> ObjectWorldModel:
+    """A world model with a latent for each object (FOCUS)."""
+    return ObjectWorldModel(
+        image_size=task.image_size,
+        proprio=task.proprio,
+        objects=len(task.objects),
+        action=task.action,
+        units=WorkspaceUnits(task.workspace.low, task.workspace.high),
+        observed=config.observed,
+        reward_head=config.reward == "head",
+        positional_encoder=config.goal == "object_latent",
+        object_features=size.object_features,
+        extractor_units=size.extractor_units,
+        **size.architecture(),
+    )
+
+
+def position_goal(model: WorldModel) -> tuple[int, TensorDictModuleBase]:
     """The goal position itself (paper, section PCP)."""
     return model.units.dim, TensorDictModule(nn.Identity(), ["goal_units"], [GOAL])
 
 
-def no_goal(model: FlatWorldModel) -> tuple[int, None]:  # noqa: ARG001
+def object_latent_goal(model: WorldModel) -> tuple[int, TensorDictModuleBase]:
+    """The latent that the object to be positioned would have at the goal (paper, section LCP)."""
+    encoder = _object_centric(model).positional_encoder
+    assert encoder is not None
+    return encoder.features, TensorDictModule(_LatentAtGoal(encoder), ["goal_units"], [GOAL])
+
+
+def no_goal(model: WorldModel) -> tuple[int, None]:  # noqa: ARG001
     """Nothing: the world model has to remember the goal that it observed."""
     return 0, None
 
 
-def learned_reward(model: FlatWorldModel) -> TensorDictModuleBase:
+def learned_reward(model: WorldModel) -> TensorDictModuleBase:
     """What the reward head predicts."""
     return model.reward()
 
 
-def position_distance_reward(model: FlatWorldModel) -> TensorDictModuleBase:
+def position_distance_reward(model: WorldModel) -> TensorDictModuleBase:
     """The distance between decoded position and goal position (paper, equation 3)."""
     return TensorDictSequential(model.object_position(), PositionDistanceReward(model.units))
 
 
+def latent_similarity_reward(model: WorldModel) -> TensorDictModuleBase:
+    """The similarity of the object's latent and the goal latent (paper, r_LCP)."""
+    return TensorDictSequential(_object_centric(model).object_latent(), LatentSimilarityReward())
+
+
+def _object_centric(model: WorldModel) -> ObjectWorldModel:
+    if not isinstance(model, ObjectWorldModel):
+        raise ValueError("goals and rewards on object latents need world_model='object'")
+    return model
+
+
 #: The choices by name. A new world model, goal, reward or goal source is one function and one entry here.
-WORLD_MODELS: dict[str, Callable[[Task, AgentConfig, Size], FlatWorldModel]] = {"flat": flat_world_model}
-GOALS: dict[str, Callable[[FlatWorldModel], tuple[int, TensorDictModuleBase | None]]] = {
+WORLD_MODELS = {
+    "flat": WorldModelChoice(flat_world_model, WorldModelLoss),
+    "object": WorldModelChoice(object_world_model, FOCUSModelLoss),
+}
+GOALS: dict[str, Callable[[WorldModel], tuple[int, TensorDictModuleBase | None]]] = {
     "none": no_goal,
     "position": position_goal,
+    "object_latent": object_latent_goal,
 }
-REWARDS: dict[str, Callable[[FlatWorldModel], TensorDictModuleBase]] = {
+REWARDS: dict[str, Callable[[WorldModel], TensorDictModuleBase]] = {
     "head": learned_reward,
     "position_distance": position_distance_reward,
+    "latent_similarity": latent_similarity_reward,
 }
-GOAL_SOURCES: dict[str, Callable[[FlatWorldModel], TensorDictModuleBase | None]] = {
+GOAL_SOURCES: dict[str, Callable[[WorldModel], TensorDictModuleBase | None]] = {
     "environment": lambda model: None,  # noqa: ARG005
     "uniform": lambda model: UniformGoals(model.units.dim),
 }
@@ -121,7 +173,7 @@ class Agent(nn.Module):
     def __init__(self, task: Task, config: AgentConfig, size: Size) -> None:
         super().__init__()
         self.task, self.config, self.size = task, config, size
-        self.model = WORLD_MODELS[config.world_model](task, config, size)
+        self.model = WORLD_MODELS[config.world_model].build(task, config, size)
         goal_features, goal_encoder = GOALS[config.goal](self.model)
         goal_source = GOAL_SOURCES[config.goal_source](self.model)
         if (goal_source is None) != (goal_encoder is None):
@@ -204,7 +256,7 @@ class Agent(nn.Module):
         self, critic: TensorDictSequential, goal_source: TensorDictModuleBase | None
     ) -> GoalConditionedDreamerLoss:
         config, size = self.config, self.size
-        model_loss = WorldModelLoss(
+        model_loss = WORLD_MODELS[config.world_model].loss(
             self.model.records(),
             lambda_dynamic=size.lambda_dynamic,
             lambda_proprio=config.lambda_proprio,
@@ -224,6 +276,17 @@ class Agent(nn.Module):
             critic, value_loss="two_hot", actor_loss=actor_loss, slow_critic_regularization=1.0
         )
         return GoalConditionedDreamerLoss(model_loss, actor_loss, value_loss, goal_source=goal_source)
+
+
+class _LatentAtGoal(nn.Module):
+    """Goal positions ``[..., D]`` to the latent ``[..., L]`` of the first object there."""
+
+    def __init__(self, encoder: LatentPositionalEncoder) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, goal_units: Tensor) -> Tensor:
+        return self.encoder(goal_units.unsqueeze(-2), object_index=0).squeeze(-2)
 
 
 def _inputs(goal_features: int) -> list[NestedKey]:

@@ -15,7 +15,7 @@ def check_choices(config: Any) -> None:
     Examples:
         >>> AgentConfig(goal="latent")
         Traceback (most recent call last):
-        ValueError: goal must be one of 'none', 'position', got 'latent'
+        ValueError: goal must be one of 'none', 'position', 'object_latent', got 'latent'
     """
     for name, hint in get_type_hints(type(config)).items():
         value = getattr(config, name)
@@ -33,9 +33,11 @@ class AgentConfig:
     """One row of the table of agents (docs/agents.md).
 
     Args:
-        world_model: Which world model.
-        goal: How a goal position becomes what policy and critic see beside the latent; ``"none"``: not at all.
-        reward: The reward in imagination: the learned head, or the distance of the decoded position to the goal.
+        world_model: Which world model: one latent for the whole scene, or one for each object too.
+        goal: How a goal position becomes what policy and critic see beside the latent: not at all, as it is,
+            or as the latent that the object would have there.
+        reward: The reward in imagination: the learned head, the distance of the decoded position to the goal, or the
+            similarity of the object's latent and the goal latent.
         goal_source: Where goals in imagination come from: ``"environment"`` (in the observations), or ``"uniform"`` in
             the workspace for each imagined start.
         observed: Vectors that the world model sees and reconstructs, beside the image.
@@ -44,9 +46,9 @@ class AgentConfig:
         lambda_goal_position: Weight of the reconstruction of the goal position.
     """
 
-    world_model: Literal["flat"] = "flat"
-    goal: Literal["none", "position"] = "none"
-    reward: Literal["head", "position_distance"] = "head"
+    world_model: Literal["flat", "object"] = "flat"
+    goal: Literal["none", "position", "object_latent"] = "none"
+    reward: Literal["head", "position_distance", "latent_similarity"] = "head"
     goal_source: Literal["environment", "uniform"] = "environment"
     observed: tuple[Literal["proprio", "object_position", "goal_position"], ...] = ("proprio", "object_position")
     lambda_proprio: float = 1.0
@@ -81,6 +83,8 @@ class Size:
         warmup: Updates until the learning rates are reached.
         gamma: Discount of a step in imagination.
         entropy_bonus: Weight of the actor's entropy.
+        object_features: Features of an object latent, for object-centric world models.
+        extractor_units: Units of the two layers that extract it.
         lambda_dynamic: Weight of the KL that trains the prior; that which trains the posterior has 0.1.
     """
 
@@ -103,6 +107,8 @@ class Size:
     warmup: int
     gamma: float = 0.99
     entropy_bonus: float = 3e-4
+    object_features: int = 256
+    extractor_units: int = 512
     lambda_dynamic: float = 1.0
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.data.dataset import EpisodeDataset
-from torchrl_ocwm.modules import FlatWorldModel
+from torchrl_ocwm.modules import WorldModel
 
 
 def write_video(path: str | Path, frames: Tensor, *, fps: int = 15, scale: int = 3) -> None:
@@ -51,7 +51,7 @@ def tile(rows: list[Tensor], gap: int = 2) -> Tensor:
 
 
 @torch.no_grad()
-def open_loop_prediction(model: FlatWorldModel, records: TensorDictBase, context: int) -> Tensor:
+def open_loop_prediction(model: WorldModel, records: TensorDictBase, context: int) -> Tensor:
     """Images that a world model predicts from the first frames and the actions alone.
 
     Args:
@@ -65,16 +65,16 @@ def open_loop_prediction(model: FlatWorldModel, records: TensorDictBase, context
     seen = model.records()(records[:, :context].clone())["next"]
     step = TensorDict({"latent": seen[:, -1].select("state", "belief")}, [len(records)])
     transition = model.transition()
-    images = list(seen["reco_pixels"].unbind(1))
+    images = list(decode_pixels(model, seen).unbind(1))
     for t in range(context, records.shape[1]):
         step = transition(step.select("latent").set("action", records["action"][:, t]))
         images.append(decode_pixels(model, step["latent"]))
     return to_uint8(torch.stack(images, 1))
 
 
-def decode_pixels(model: FlatWorldModel, latent: TensorDictBase) -> Tensor:
+def decode_pixels(model: WorldModel, latent: TensorDictBase) -> Tensor:
     """Images ``[..., 3, H, W]`` float32 in [0, 1], unbounded, of latents ``{state, belief}``."""
-    return model.image_decoder(latent["state"], latent["belief"])
+    return model.pixels(latent["state"], latent["belief"])
 
 
 def to_uint8(images: Tensor) -> Tensor:

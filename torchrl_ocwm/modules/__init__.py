@@ -5,10 +5,17 @@ from torchrl_ocwm.modules.actor import Actor
 from torchrl_ocwm.modules.goals import UniformGoals
 from torchrl_ocwm.modules.imagination import ImaginationEnv
 from torchrl_ocwm.modules.latent import InitialLatent
+from torchrl_ocwm.modules.object_world_model import ObjectWorldModel
+from torchrl_ocwm.modules.objects import LatentPositionalEncoder, ObjectDecoder, ObjectLatentExtractor
 from torchrl_ocwm.modules.observation import ObservationEncoder
-from torchrl_ocwm.modules.rewards import PositionDistance, PositionDistanceReward, position_distance
+from torchrl_ocwm.modules.rewards import (
+    LatentSimilarityReward,
+    PositionDistance,
+    PositionDistanceReward,
+    position_distance,
+)
 from torchrl_ocwm.modules.units import WorkspaceUnits
-from torchrl_ocwm.modules.world_model import FlatWorldModel
+from torchrl_ocwm.modules.world_model import FlatWorldModel, WorldModel
 
 __all__ = [
     "ActingLatent",
@@ -16,10 +23,16 @@ __all__ = [
     "FlatWorldModel",
     "ImaginationEnv",
     "InitialLatent",
+    "LatentPositionalEncoder",
+    "LatentSimilarityReward",
+    "ObjectDecoder",
+    "ObjectLatentExtractor",
+    "ObjectWorldModel",
     "ObservationEncoder",
     "PositionDistance",
     "PositionDistanceReward",
     "UniformGoals",
     "WorkspaceUnits",
+    "WorldModel",
     "position_distance",
 ]

@@ -67,13 +67,13 @@ def make_image_encoder(style: Style, image_size: int, *, depth: int, mults: tupl
 
 
 def make_image_decoder(
-    style: Style, in_features: int, image_size: int, *, depth: int, mults: tuple[int, ...]
+    style: Style, in_features: int, image_size: int, *, depth: int, mults: tuple[int, ...], channels: int = 3
 ) -> nn.Module:
-    """A CNN from state and belief to images ``[..., 3, H, W]`` float32 in [0, 1], unbounded."""
+    """A CNN from latents to images ``[..., channels, H, W]`` float32 in [0, 1], unbounded."""
     _check_image_size(style, image_size, mults)
     if style == "dreamer_v3":
-        return DreamerV3ImageDecoder(in_features, (3, image_size, image_size), depth, tuple(mults), num_blocks=1)
-    return _ShiftedImage(ObsDecoder(depth, latent_dim=in_features))
+        return DreamerV3ImageDecoder(in_features, (channels, image_size, image_size), depth, tuple(mults), num_blocks=1)
+    return _ShiftedImage(ObsDecoder(depth, latent_dim=in_features, out_channels=channels))
 
 
 def make_rssm(
@@ -132,4 +132,5 @@ class _ShiftedImage(nn.Module):
         self.decoder = decoder
 
     def forward(self, *latent: Tensor) -> Tensor:
-        return self.decoder(*latent) + 0.5
+        whole = torch.cat(latent, -1)
+        return self.decoder(whole, whole[..., :0]) + 0.5

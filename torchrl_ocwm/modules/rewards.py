@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torch.nn.functional import cosine_similarity
 
 from torchrl_ocwm.modules.units import WorkspaceUnits
 
@@ -45,6 +48,61 @@ class PositionDistance(nn.Module):
     def forward(self, positions: Tensor, goal: Tensor) -> Tensor:
         position = positions.unflatten(-1, (-1, self.units.dim))[..., self.object_index, :]
         return position_distance(self.units.to_metres(position), self.units.to_metres(goal))  # Eq. 3
+
+
+class LatentSimilarity(nn.Module):
+    """Cosine similarity of an object's latent and a goal latent (paper, r_LCP), or minus their mean squared error.
+
+    Args:
+        object_index: Which object is to be positioned.
+        distance: ``"cosine"`` or ``"mse"``.
+
+    Called with object latents ``[..., O + 1, L]`` and goals ``[..., L]``; returns ``[..., 1]``.
+    """
+
+    def __init__(self, object_index: int = 0, distance: Literal["cosine", "mse"] = "cosine") -> None:
+        super().__init__()
+        self.object_index, self.distance = object_index, distance
+
+    def forward(self, object_latent: Tensor, goal: Tensor) -> Tensor:
+        latent = object_latent[..., self.object_index, :]
+        if self.distance == "cosine":
+            return cosine_similarity(latent, goal, dim=-1).unsqueeze(-1)
+        return -(latent - goal).square().mean(-1, keepdim=True)
+
+
+class LatentSimilarityReward(TensorDictModule):
+    """How similar the extracted latent of an object is to the goal latent.
+
+    Reward of the latent-conditioned policy (paper, section LCP).
+
+    Args:
+        object_index: Which object is to be positioned; any of the scene.
+        distance: Cosine similarity, or minus the mean squared error (``"mse"``).
+        object_latent_key: Extracted latents, ``[..., O + 1, L]``.
+        goal_key: Goal latent, ``[..., L]``.
+        reward_key: Key written, ``[..., 1]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> latents = torch.tensor([[[3.0, 4.0], [1.0, 0.0]]])
+        >>> data = TensorDict({"object_latent": latents, "latent": {"goal": torch.tensor([[0.0, 2.0]])}}, [1])
+        >>> LatentSimilarityReward()(data)["reward"]
+        tensor([[0.8000]])
+    """
+
+    def __init__(
+        self,
+        *,
+        object_index: int = 0,
+        distance: Literal["cosine", "mse"] = "cosine",
+        object_latent_key: NestedKey = "object_latent",
+        goal_key: NestedKey = ("latent", "goal"),
+        reward_key: NestedKey = "reward",
+    ) -> None:
+        similarity = LatentSimilarity(object_index, distance)
+        super().__init__(similarity, in_keys=[object_latent_key, goal_key], out_keys=[reward_key])
 
 
 class PositionDistanceReward(TensorDictModule):

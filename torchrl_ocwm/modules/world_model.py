@@ -1,8 +1,9 @@
-"""The flat world model: one latent state for the whole scene."""
+"""World models: encoder, RSSM, vector decoders and heads; the flat one with one latent state for the whole scene."""
 
 from __future__ import annotations
 
-from typing import Literal
+from abc import ABC, abstractmethod
+from typing import Any, Literal
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
@@ -19,12 +20,14 @@ VectorName = Literal["proprio", "object_position", "goal_position"]
 _KEYS: dict[str, str] = {"proprio": "proprio", "object_position": "object_units", "goal_position": "goal_units"}
 
 
-class FlatWorldModel(nn.Module):
+class WorldModel(nn.Module, ABC):
     """Encoder, discrete RSSM, decoders and heads, as TensorDictModules for training, imagination and acting.
 
     The networks exist once; each method gives a module that applies them to the keys of one place:
     :meth:`records` to sequences of records, :meth:`transition`, :meth:`object_position`, :meth:`reward` and
     :meth:`continuation` to imagined latents, :meth:`filter` to the observations that a policy acts on.
+
+    A subclass says how the scene is decoded: :meth:`images`, :meth:`pixels` and :meth:`object_position`.
 
     Args:
         image_size: Height and width of the images, pixels.
@@ -32,7 +35,8 @@ class FlatWorldModel(nn.Module):
         objects: Number of objects O.
         action: Number of actions A.
         units: Workspace units of the positions.
-        observed: Vectors that the encoder sees and the decoder reconstructs.
+        observed: Vectors that the encoder sees.
+        decoded: Those of them that are decoded from the latent of the scene.
         reward_head: Whether to predict the reward.
         cnn_depth: Channels of the CNN's first stage before its multiplier.
         cnn_mults: Channel multiplier of each stage.
@@ -44,14 +48,6 @@ class FlatWorldModel(nn.Module):
         mlp_layers: Hidden layers of the vector encoder, decoders and heads.
         mlp_units: Units of each.
         style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
-
-    Examples:
-        >>> from torchrl_ocwm.testing import random_records, reacher_task
-        >>> from torchrl_ocwm.agents import build_agent
-        >>> model = build_agent("dreamer_pcp", reacher_task(), size="debug").model
-        >>> records = model.records()(random_records(reacher_task(), 2, 5))
-        >>> records["next", "reco_pixels"].shape
-        torch.Size([2, 5, 3, 64, 64])
     """
 
     def __init__(
@@ -63,6 +59,7 @@ class FlatWorldModel(nn.Module):
         action: int,
         units: WorkspaceUnits,
         observed: tuple[VectorName, ...],
+        decoded: tuple[VectorName, ...],
         reward_head: bool,
         cnn_depth: int,
         cnn_mults: tuple[int, ...],
@@ -101,10 +98,7 @@ class FlatWorldModel(nn.Module):
             blocks=gru_blocks,
         )
         latent = self.latent_features
-        self.image_decoder = make_image_decoder(style, latent, image_size, depth=cnn_depth, mults=cnn_mults)
-        self.vector_decoders = nn.ModuleDict(
-            {name: make_mlp(style, latent, features, **mlp) for name, features in vectors.items()}
-        )
+        self.vector_decoders = nn.ModuleDict({name: make_mlp(style, latent, vectors[name], **mlp) for name in decoded})
         self.continue_head = make_mlp(style, latent, 1, layers=1, units=mlp_units)
         self.two_hot = SymExpTwoHot()
         self.reward_head = make_mlp(style, latent, self.two_hot.num_bins, outscale=0.0, **mlp) if reward_head else None
@@ -136,18 +130,30 @@ class FlatWorldModel(nn.Module):
 
     def decoders(self, *at: str) -> list[TensorDictModuleBase]:
         """Predictions of all that was observed, and of reward and continuation, from the latent at a place."""
-        latent = _latent(at)
-        modules = [TensorDictModule(self.image_decoder, latent, [_key(at, "reco_pixels")]), *self.vectors(*at)]
+        latent = latent_at(at)
+        modules = [*self.vectors(*at), *self.images(*at)]
         if self.reward_head is not None:
-            modules.append(TensorDictModule(self.reward_head, latent, [_key(at, "reward_logits")]))
-            modules.append(TensorDictModule(self.two_hot, [_key(at, "reward_logits")], [_key(at, "reward")]))
-        modules.append(TensorDictModule(self.continue_head, latent, [_key(at, "continue_pred")]))
+            modules.append(TensorDictModule(self.reward_head, latent, [key_at(at, "reward_logits")]))
+            modules.append(TensorDictModule(self.two_hot, [key_at(at, "reward_logits")], [key_at(at, "reward")]))
+        modules.append(TensorDictModule(self.continue_head, latent, [key_at(at, "continue_pred")]))
         return modules
 
-    def vectors(self, *at: str) -> list[TensorDictModule]:
+    @abstractmethod
+    def images(self, *at: str) -> list[TensorDictModuleBase]:
+        """Predictions of what is seen, from what :meth:`vectors` has left at a place."""
+
+    @abstractmethod
+    def pixels(self, state: Tensor, belief: Tensor) -> Tensor:
+        """Predicted images ``[..., 3, H, W]`` in [0, 1], unbounded."""
+
+    @abstractmethod
+    def object_position(self) -> TensorDictModuleBase:
+        """Decoded object positions ``object_units`` ``[..., O * D]`` of imagined latents, in workspace units."""
+
+    def vectors(self, *at: str) -> list[TensorDictModuleBase]:
         """Predictions of the observed vectors from the latent at a place: ``reco_proprio``, …, ``reco_goal_units``."""
         return [
-            TensorDictModule(decoder, _latent(at), [_key(at, f"reco_{_KEYS[name]}")])
+            TensorDictModule(decoder, latent_at(at), [key_at(at, f"reco_{_KEYS[name]}")])
             for name, decoder in self.vector_decoders.items()
         ]
 
@@ -156,31 +162,21 @@ class FlatWorldModel(nn.Module):
         modules: list[TensorDictModuleBase] = []
         if "object_position" in self.observed:
             flatten = _ObjectUnits(self.units)
-            modules.append(TensorDictModule(flatten, [_key(at, "object_position")], [_key(at, "object_units")]))
+            modules.append(TensorDictModule(flatten, [key_at(at, "object_position")], [key_at(at, "object_units")]))
         if "goal_position" in self.observed:
-            modules.append(TensorDictModule(self.units, [_key(at, "goal_position")], [_key(at, "goal_units")]))
-        inputs = [_key(at, "pixels"), *(_key(at, _KEYS[name]) for name in self.observed)]
-        return [*modules, TensorDictModule(self.encoder, inputs, [_key(at, "encoded_latents")])]
+            modules.append(TensorDictModule(self.units, [key_at(at, "goal_position")], [key_at(at, "goal_units")]))
+        inputs = [key_at(at, "pixels"), *(key_at(at, _KEYS[name]) for name in self.observed)]
+        return [*modules, TensorDictModule(self.encoder, inputs, [key_at(at, "encoded_latents")])]
 
     # Modules for imagination, on ``latent = {state, belief, goal}``.
 
     def transition(self) -> TensorDictSequential:
         """Next state and belief, sampled from the prior. Actions beyond [−1, 1] count as clipped."""
-        latent = _latent(("latent",))
+        latent = latent_at(("latent",))
         return TensorDictSequential(
             TensorDictModule(_bounded, ["action"], ["bounded_action"]),
             TensorDictModule(self.prior, [*latent, "bounded_action"], ["_", *latent]),
         )
-
-    def object_position(self) -> TensorDictModule:
-        """Decoded object positions ``object_units`` ``[..., O * D]``, in workspace units.
-
-        Raises:
-            ValueError: if the model does not decode them.
-        """
-        if "object_position" not in self.vector_decoders:
-            raise ValueError("this world model does not decode object positions; add 'object_position' to `observed`")
-        return TensorDictModule(self.vector_decoders["object_position"], _latent(("latent",)), ["object_units"])
 
     def reward(self) -> TensorDictSequential:
         """Predicted reward ``[..., 1]``.
@@ -191,14 +187,14 @@ class FlatWorldModel(nn.Module):
         if self.reward_head is None:
             raise ValueError("this world model has no reward head; build it with reward_head=True")
         return TensorDictSequential(
-            TensorDictModule(self.reward_head, _latent(("latent",)), ["reward_logits"]),
+            TensorDictModule(self.reward_head, latent_at(("latent",)), ["reward_logits"]),
             TensorDictModule(self.two_hot, ["reward_logits"], ["reward"]),
         )
 
     def continuation(self) -> TensorDictSequential:
         """Predicted probability ``continuation`` ``[..., 1]`` that the episode goes on."""
         return TensorDictSequential(
-            TensorDictModule(self.continue_head, _latent(("latent",)), ["continue_pred"]),
+            TensorDictModule(self.continue_head, latent_at(("latent",)), ["continue_pred"]),
             TensorDictModule(torch.sigmoid, ["continue_pred"], ["continuation"]),
         )
 
@@ -209,7 +205,7 @@ class FlatWorldModel(nn.Module):
 
         Reads observations, ``is_init`` and ``latent = {state, belief, action}``; writes the new state and belief.
         """
-        latent = _latent(("latent",))
+        latent = latent_at(("latent",))
         estimator = RSSMStateEstimatorV3(
             self.prior,
             self.posterior,
@@ -217,6 +213,61 @@ class FlatWorldModel(nn.Module):
             out_keys=latent,
         )
         return TensorDictSequential(*self._encode(), estimator)
+
+
+class FlatWorldModel(WorldModel):
+    """One latent state for the whole scene, from which image and vectors are decoded (Dreamer).
+
+    Args:
+        image_size: Height and width of the images, pixels.
+        observed: Vectors that the encoder sees and the decoder reconstructs.
+        cnn_depth: Channels of the CNN's first stage before its multiplier.
+        cnn_mults: Channel multiplier of each stage.
+        style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
+        kwargs: The other arguments of :class:`WorldModel`.
+
+    Examples:
+        >>> from torchrl_ocwm.testing import random_records, reacher_task
+        >>> from torchrl_ocwm.agents import build_agent
+        >>> model = build_agent("dreamer_pcp", reacher_task(), size="debug").model
+        >>> records = model.records()(random_records(reacher_task(), 2, 5))
+        >>> records["next", "reco_pixels"].shape
+        torch.Size([2, 5, 3, 64, 64])
+    """
+
+    def __init__(
+        self,
+        *,
+        image_size: int,
+        observed: tuple[VectorName, ...],
+        cnn_depth: int,
+        cnn_mults: tuple[int, ...],
+        style: Style = "dreamer_v3",
+        **kwargs: Any,
+    ) -> None:
+        cnn: dict[str, Any] = {"cnn_depth": cnn_depth, "cnn_mults": cnn_mults}
+        super().__init__(image_size=image_size, observed=observed, decoded=observed, style=style, **cnn, **kwargs)
+        self.image_decoder = make_image_decoder(
+            style, self.latent_features, image_size, depth=cnn_depth, mults=cnn_mults
+        )
+
+    def images(self, *at: str) -> list[TensorDictModuleBase]:
+        """``reco_pixels``."""
+        return [TensorDictModule(self.image_decoder, latent_at(at), [key_at(at, "reco_pixels")])]
+
+    def pixels(self, state: Tensor, belief: Tensor) -> Tensor:
+        """Predicted images ``[..., 3, H, W]`` in [0, 1], unbounded."""
+        return self.image_decoder(state, belief)
+
+    def object_position(self) -> TensorDictModule:
+        """Decoded object positions ``object_units`` ``[..., O * D]``, in workspace units.
+
+        Raises:
+            ValueError: if the model does not decode them.
+        """
+        if "object_position" not in self.vector_decoders:
+            raise ValueError("this world model does not decode object positions; add 'object_position' to `observed`")
+        return TensorDictModule(self.vector_decoders["object_position"], latent_at(("latent",)), ["object_units"])
 
 
 class _ObjectUnits(nn.Module):
@@ -235,9 +286,9 @@ def _bounded(action: Tensor) -> Tensor:
     return action / action.detach().abs().clamp_min(1)
 
 
-def _key(at: tuple[str, ...], name: str) -> NestedKey:
+def key_at(at: tuple[str, ...], name: str) -> NestedKey:
     return unravel_key((*at, name))
 
 
-def _latent(at: tuple[str, ...]) -> list[NestedKey]:
-    return [_key(at, "state"), _key(at, "belief")]
+def latent_at(at: tuple[str, ...]) -> list[NestedKey]:
+    return [key_at(at, "state"), key_at(at, "belief")]

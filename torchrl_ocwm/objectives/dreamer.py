@@ -73,10 +73,8 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
     @property
     def in_keys(self) -> list[NestedKey]:
         """What the world model reads, and the targets of its predictions."""
-        model, value = self.model_loss.tensor_keys, self.value_loss.tensor_keys
-        targets = [model.pixels, model.proprio, model.reward, model.terminated, value.done]
-        keys = [*self.model_loss.world_model.in_keys, self.tensor_keys.is_init]
-        keys += [unravel_key(("next", key)) for key in targets]
+        model, done = self.model_loss, unravel_key(("next", self.value_loss.tensor_keys.done))
+        keys = [*model.world_model.in_keys, self.tensor_keys.is_init, *model.targets, done]
         return list(dict.fromkeys(keys))
 
     def forward(self, sample: TensorDictBase) -> TensorDictBase:

@@ -149,6 +149,12 @@ class WorldModelLoss(DreamerV3ModelLoss):
         self.lambda_object_position = lambda_object_position
         self.lambda_goal_position = lambda_goal_position
 
+    @property
+    def targets(self) -> list[NestedKey]:
+        """What the losses compare predictions with."""
+        keys = self.tensor_keys
+        return [unravel_key(("next", key)) for key in (keys.pixels, keys.proprio, keys.reward, keys.terminated)]
+
     def forward(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Losses of records ``[B, T]``, scalars, and the records with the predictions."""
         missing = [key for key in self.world_model.in_keys if tensordict.get(key, None) is None]

@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_ocwm.modules import (
+    LatentPositionalEncoder,
+    LatentSimilarityReward,
+    ObjectDecoder,
+    ObjectLatentExtractor,
+)
+from torchrl_ocwm.modules.objects import compose
+
+
+def test_extractor_is_one_mlp_per_id() -> None:
+    """One batched pass gives what one pass per object and sample gives."""
+    extractor = ObjectLatentExtractor(6, instances=3, features=5, units=8)
+    state, belief = torch.randn(4, 2, 4), torch.randn(4, 2, 2)
+    latents = extractor(state, belief)
+    for i in range(4):
+        for j in range(2):
+            for instance in range(3):
+                one_hot = torch.zeros(3)
+                one_hot[instance] = 1
+                alone = extractor.mlp(torch.cat([state[i, j], belief[i, j], one_hot]))
+                torch.testing.assert_close(latents[i, j, instance], alone)
+    assert (latents[:, :, 0] - latents[:, :, 1]).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
+def test_decoder_takes_each_latent_alone(style: Any) -> None:
+    decoder = ObjectDecoder(8, 64, cnn_depth=2, cnn_mults=(1, 2, 2, 2), style=style)
+    latents = torch.randn(2, 3, 8)
+    colours, logits = decoder(latents)
+    assert colours.shape == (2, 3, 3, 64, 64)
+    for i in range(2):
+        for instance in range(3):
+            alone_colours, alone_logits = decoder(latents[i : i + 1, instance : instance + 1])
+            torch.testing.assert_close(colours[i, instance], alone_colours[0, 0], rtol=1e-4, atol=1e-5)
+            torch.testing.assert_close(logits[i, instance], alone_logits[0, 0], rtol=1e-4, atol=1e-5)
+
+
+def test_compose_pixel_by_pixel() -> None:
+    colours, logits = torch.rand(2, 3, 3, 4, 5), torch.randn(2, 3, 4, 5)
+    image = compose(colours, logits)
+    for batch in range(2):
+        for row in range(4):
+            for column in range(5):
+                weights = logits[batch, :, row, column].exp()
+                expected = sum(w * c for w, c in zip(weights, colours[batch, :, :, row, column], strict=True))
+                torch.testing.assert_close(image[batch, :, row, column], expected / weights.sum())
+
+
+def test_positional_encoder_per_object() -> None:
+    encoder = LatentPositionalEncoder(2, objects=3, features=5, units=8)
+    positions = torch.rand(4, 3, 2)
+    latents = encoder(positions)
+    for index in range(3):
+        one_hot = torch.zeros(3)
+        one_hot[index] = 1
+        for i in range(4):
+            alone = encoder.mlp(torch.cat([positions[i, index], one_hot]))
+            torch.testing.assert_close(latents[i, index], alone)
+        torch.testing.assert_close(
+            encoder(positions[:, index : index + 1], object_index=index)[:, 0], latents[:, index]
+        )
+
+
+class TestLatentSimilarityReward:
+    data = TensorDict(
+        {
+            "object_latent": torch.tensor([[[3.0, 4.0], [0.0, -2.0], [9.0, 9.0]]]),
+            "latent": {"goal": torch.tensor([[0.0, 5.0]])},
+        },
+        [1],
+    )
+
+    @pytest.mark.parametrize(("index", "expected"), [(0, 0.8), (1, -1.0)])
+    def test_cosine_by_hand(self, index: int, expected: float) -> None:
+        reward = LatentSimilarityReward(object_index=index)(self.data.clone())["reward"]
+        torch.testing.assert_close(reward, torch.tensor([[expected]]))
+
+    def test_mse_by_hand(self) -> None:
+        reward = LatentSimilarityReward(distance="mse")(self.data.clone())["reward"]
+        torch.testing.assert_close(reward, torch.tensor([[-5.0]]))
+
+
+def test_positions_come_from_the_objects_own_latent(make_agent: Any) -> None:
+    """The position of an object depends on its latent, and the background has none."""
+    model = make_agent("focus_pcp").model
+    latents = torch.randn(3, 2, model.extractor.features, requires_grad=True)
+    positions = model.position_decoder(latents)
+    assert positions.shape == (3, 2)
+    positions.sum().backward()
+    assert latents.grad is not None
+    assert latents.grad[:, 0].abs().min() > 0
+    assert latents.grad[:, 1].abs().max() == 0
+
+
+def test_model_pixels_are_the_composed_instances(make_agent: Any) -> None:
+    model = make_agent("focus").model
+    state, belief = torch.rand(2, model.state), torch.rand(2, model.belief)
+    image: Tensor = model.pixels(state, belief)
+    colours, logits = model.object_decoder(model.extractor(state, belief))
+    weights = logits.exp() / logits.exp().sum(1, keepdim=True)
+    torch.testing.assert_close(image, torch.einsum("bnhw,bnchw->bchw", weights, colours))

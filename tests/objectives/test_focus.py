@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from torchrl_ocwm.objectives import FOCUSModelLoss, mask_nll, object_reconstruction, positional_latent_loss
+from torchrl_ocwm.objectives.focus import visible_position_reconstruction
+
+
+@pytest.fixture
+def scene() -> dict[str, torch.Tensor]:
+    masks = torch.zeros(2, 2, 4, 5, dtype=torch.bool)
+    masks[0, 0, :2] = True
+    masks[0, 1, 1:3, :2] = True  # overlaps the first object, which goes before it
+    masks[1, 1, 0] = True  # the first object is hidden
+    return {
+        "masks": masks,
+        "logits": torch.randn(2, 3, 4, 5),
+        "colours": torch.rand(2, 3, 3, 4, 5),
+        "pixels": torch.randint(0, 256, (2, 3, 4, 5), dtype=torch.uint8),
+    }
+
+
+def instance(masks: torch.Tensor, batch: int, row: int, column: int) -> int:
+    for index in range(masks.shape[1]):
+        if masks[batch, index, row, column]:
+            return index
+    return masks.shape[1]
+
+
+def test_mask_nll_pixel_by_pixel(scene: dict[str, torch.Tensor]) -> None:
+    total = 0.0
+    for batch in range(2):
+        for row in range(4):
+            for column in range(5):
+                logits = scene["logits"][batch, :, row, column].tolist()
+                true = instance(scene["masks"], batch, row, column)
+                total -= math.log(math.exp(logits[true]) / sum(map(math.exp, logits)))
+    assert float(mask_nll(scene["logits"], scene["masks"])) == pytest.approx(total / 2, rel=1e-5)
+
+
+def test_object_reconstruction_pixel_by_pixel(scene: dict[str, torch.Tensor]) -> None:
+    total = 0.0
+    for batch in range(2):
+        for row in range(4):
+            for column in range(5):
+                true = instance(scene["masks"], batch, row, column)
+                for channel in range(3):
+                    seen = int(scene["pixels"][batch, channel, row, column]) / 255
+                    total += (float(scene["colours"][batch, true, channel, row, column]) - seen) ** 2
+    got = float(object_reconstruction(scene["colours"], scene["pixels"], scene["masks"]))
+    assert got == pytest.approx(total / 2, rel=1e-5)
+
+
+def test_hidden_objects_add_nothing(scene: dict[str, torch.Tensor]) -> None:
+    """No colour outside its mask, no position while hidden, and finite gradients."""
+    colours = scene["colours"].clone().requires_grad_()
+    object_reconstruction(colours, scene["pixels"], scene["masks"]).backward()
+    assert colours.grad[1, 0].abs().max() == 0
+    assert colours.grad[1, 1].abs().max() > 0
+    position = torch.tensor([[1.0, 1.0, 2.0, 2.0]], requires_grad=True)
+    visible_position_reconstruction(position, torch.zeros(1, 4), torch.tensor([[False, True]])).backward()
+    assert position.grad[0, :2].abs().max() == 0
+    assert position.grad[0, 2:].abs().min() > 0
+
+
+def test_everything_hidden_is_finite(make_agent: Any, records: TensorDict) -> None:
+    records["next", "masks"].zero_()
+    records["next", "object_visible"].zero_()
+    agent = make_agent("focus_lcp")
+    losses, _ = agent.loss.model_loss(records)
+    sum(losses.values()).backward()
+    assert losses["loss_model_object_position"] == 0
+    assert losses["loss_model_positional"] == 0
+    assert all(parameter.grad.isfinite().all() for parameter in agent.model.parameters() if parameter.grad is not None)
+
+
+@pytest.mark.parametrize("distance", ["cosine", "mse"])
+def test_positional_loss_object_by_object(distance: Any) -> None:
+    predicted, extracted = torch.randn(4, 2, 3), torch.randn(4, 2, 3)
+    visible = torch.tensor([[True, False], [True, True], [False, False], [True, True]])
+    total = 0.0
+    for i in range(4):
+        for j in range(2):
+            if visible[i, j]:
+                a, b = predicted[i, j], extracted[i, j]
+                cosine = float((a * b).sum()) / math.sqrt(float((a * a).sum()) * float((b * b).sum()))
+                total += -cosine if distance == "cosine" else float(((a - b) ** 2).sum()) / 3
+    got = positional_latent_loss(predicted, extracted, visible, distance=distance)
+    assert float(got) == pytest.approx(total / 4, rel=1e-5)
+
+
+@pytest.mark.parametrize(("gradient", "sides"), [("encoder", "p"), ("latent", "e"), ("both", "pe")])
+def test_positional_loss_trains_the_chosen_side(gradient: Any, sides: str) -> None:
+    predicted, extracted = (torch.randn(4, 1, 3, requires_grad=True) for _ in range(2))
+    positional_latent_loss(predicted, extracted, torch.ones(4, 1, dtype=torch.bool), gradient=gradient).backward()
+    assert (predicted.grad is not None) == ("p" in sides)
+    assert (extracted.grad is not None) == ("e" in sides)
+
+
+def moved(module: nn.Module) -> bool:
+    return any(float(p.grad.abs().sum()) > 0 for p in module.parameters() if p.grad is not None)
+
+
+def test_l_pos_moves_the_positional_encoder_and_nothing_else(make_agent: Any, records: TensorDict) -> None:
+    agent = make_agent("focus_lcp")
+    agent.loss.model_loss(records)[0]["loss_model_positional"].backward()
+    assert moved(agent.model.positional_encoder)
+    others = [child for name, child in agent.model.named_children() if name != "positional_encoder"]
+    assert not any(map(moved, others))
+
+
+@pytest.mark.parametrize("name", ["focus", "focus_pcp", "focus_lcp"])
+def test_policy_losses_leave_model_and_encoder_alone(make_agent: Any, records: TensorDict, name: str) -> None:
+    agent = make_agent(name)
+    losses = agent.loss(records)
+    (losses["loss_actor"] + losses["loss_value"]).backward()
+    assert not moved(agent.model)
+    assert moved(agent.actor)
+
+
+@pytest.mark.parametrize("part", ["masks", "object_pixels", "object_position"])
+def test_object_terms_train_the_rssm(make_agent: Any, records: TensorDict, part: str) -> None:
+    agent = make_agent("focus")
+    agent.loss.model_loss(records)[0][f"loss_model_{part}"].backward()
+    reached = {name for name, child in agent.model.named_children() if moved(child)}
+    decoder = "position_decoder" if part == "object_position" else "object_decoder"
+    assert reached == {"prior", "posterior", "encoder", "extractor", decoder}
+
+
+def test_latent_reward_teaches_the_actor_through_the_dynamics(make_agent: Any, records: TensorDict) -> None:
+    agent = make_agent("focus_lcp")
+    latent = agent.model.records()(records)["next"].select("state", "belief")
+    start = agent.loss.imagination_start(latent)
+    rollout = agent.imagination.rollout(3, agent.actor, auto_reset=False, tensordict=start, break_when_any_done=False)
+    rollout["next", "reward"][:, -1].sum().backward()
+    assert moved(agent.actor)
+
+
+def test_goal_latents_are_encoded_positions(make_agent: Any, records: TensorDict) -> None:
+    agent = make_agent("focus_lcp")
+    latent = agent.model.records()(records)["next"].select("state", "belief")
+    start = agent.loss.imagination_start(latent)
+    goals = agent.model.positional_encoder(start["goal_units"].unsqueeze(-2))[:, 0]
+    torch.testing.assert_close(start["latent", "goal"], goals)
+    assert not start["latent", "goal"].requires_grad
+
+
+def test_weights_and_keys(make_agent: Any, records: TensorDict) -> None:
+    world_model = make_agent("focus_lcp").model.records()
+
+    def losses(loss: FOCUSModelLoss, batch: TensorDict = records) -> TensorDict:
+        torch.manual_seed(1)
+        return loss(batch)[0]
+
+    plain = losses(FOCUSModelLoss(world_model))
+    for part in ("masks", "object_pixels", "positional", "object_position"):
+        scaled = losses(FOCUSModelLoss(world_model, **{f"lambda_{part}": 3.0}))
+        torch.testing.assert_close(scaled[f"loss_model_{part}"], 3 * plain[f"loss_model_{part}"])
+    nested = FOCUSModelLoss(world_model)
+    nested.set_keys(masks=("seen", "masks"), object_visible=("seen", "flag"))
+    batch = records.clone()
+    batch["next", "seen"] = {"masks": batch["next"].pop("masks"), "flag": batch["next"].pop("object_visible")}
+    got = losses(nested, batch)
+    for name, value in plain.items():
+        torch.testing.assert_close(got[name], value)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_noise")
+def test_update_of_lcp_compiles_into_one_graph(make_agent: Any, records: TensorDict) -> None:
+    records = records[:, :3]
+    expected = make_agent("focus_lcp").loss(records)
+    loss = make_agent("focus_lcp").loss
+    losses = torch.compile(lambda batch: loss(batch), fullgraph=True, backend="eager")(records)
+    for key in expected.keys(True, True):
+        torch.testing.assert_close(losses[key], expected[key], msg=str(key))

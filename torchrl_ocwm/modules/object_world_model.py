@@ -1,0 +1,151 @@
+"""The object-centric world model: what is seen is decoded object by object."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+
+from torchrl_ocwm.modules.networks import Style, make_mlp
+from torchrl_ocwm.modules.objects import LatentPositionalEncoder, ObjectDecoder, ObjectLatentExtractor, compose
+from torchrl_ocwm.modules.world_model import VectorName, WorldModel, key_at, latent_at
+
+
+class ObjectWorldModel(WorldModel):
+    """The world model of FOCUS: object latents are extracted from the latent of the scene and decoded one by one.
+
+    Colours and masks come from an :class:`~torchrl_ocwm.modules.ObjectDecoder`, positions from an MLP on each object
+    latent. What is not an object, proprioception and goal, is decoded from the latent of the scene.
+
+    Args:
+        image_size: Height and width of the images, pixels.
+        objects: Number of objects O; the background is one instance more.
+        observed: Vectors that the encoder sees.
+        object_features: Features of an object latent L.
+        extractor_units: Units of the two hidden layers of the extractor.
+        positional_encoder: Whether to learn the latent of an object at a position (LCP).
+        cnn_depth: Channels of the CNNs' first stage before its multiplier.
+        cnn_mults: Channel multiplier of each stage.
+        mlp_layers: Hidden layers of the vector encoder, decoders and heads.
+        mlp_units: Units of each.
+        style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
+        kwargs: The other arguments of :class:`~torchrl_ocwm.modules.WorldModel`.
+
+    Raises:
+        ValueError: if the object positions are not observed.
+
+    Examples:
+        >>> from torchrl_ocwm.testing import random_records, reacher_task
+        >>> from torchrl_ocwm.agents import build_agent
+        >>> model = build_agent("focus_pcp", reacher_task(), size="debug").model
+        >>> records = model.records()(random_records(reacher_task(), 2, 5))
+        >>> records["next", "mask_logits"].shape
+        torch.Size([2, 5, 2, 64, 64])
+    """
+
+    def __init__(
+        self,
+        *,
+        image_size: int,
+        objects: int,
+        observed: tuple[VectorName, ...],
+        object_features: int,
+        extractor_units: int,
+        positional_encoder: bool,
+        cnn_depth: int,
+        cnn_mults: tuple[int, ...],
+        mlp_layers: int,
+        mlp_units: int,
+        style: Style = "dreamer_v3",
+        **kwargs: Any,
+    ) -> None:
+        if "object_position" not in observed:
+            raise ValueError(
+                "an object-centric world model learns from object positions: 'object_position' in `observed`"
+            )
+        mlp: dict[str, Any] = {"style": style, "layers": mlp_layers, "units": mlp_units}
+        cnn: dict[str, Any] = {"style": style, "cnn_depth": cnn_depth, "cnn_mults": cnn_mults}
+        super().__init__(
+            image_size=image_size,
+            objects=objects,
+            observed=observed,
+            decoded=tuple(name for name in observed if name != "object_position"),
+            mlp_layers=mlp_layers,
+            mlp_units=mlp_units,
+            **cnn,
+            **kwargs,
+        )
+        self.objects = objects
+        self.extractor = ObjectLatentExtractor(
+            self.latent_features,
+            instances=objects + 1,
+            features=object_features,
+            units=extractor_units,
+            style=style,
+        )
+        self.object_decoder = ObjectDecoder(object_features, image_size, **cnn)
+        self.position_decoder = _ObjectPositions(
+            objects, make_mlp(in_features=object_features, out_features=self.units.dim, **mlp)
+        )
+        self.positional_encoder = None
+        if positional_encoder:
+            self.positional_encoder = LatentPositionalEncoder(
+                self.units.dim, objects=objects, features=object_features, **mlp
+            )
+
+    def vectors(self, *at: str) -> list[TensorDictModuleBase]:
+        """Object latents and positions, and the vectors that are not of objects."""
+        modules: list[TensorDictModuleBase] = [
+            *super().vectors(*at),
+            TensorDictModule(self.extractor, latent_at(at), [key_at(at, "object_latent")]),
+            TensorDictModule(self.position_decoder, [key_at(at, "object_latent")], [key_at(at, "reco_object_units")]),
+        ]
+        return modules
+
+    def images(self, *at: str) -> list[TensorDictModuleBase]:
+        """``reco_object_pixels`` and ``mask_logits``; with a positional encoder ``positional_latent`` too."""
+        out = [key_at(at, "reco_object_pixels"), key_at(at, "mask_logits")]
+        modules: list[TensorDictModuleBase] = [
+            TensorDictModule(self.object_decoder, [key_at(at, "object_latent")], out)
+        ]
+        if self.positional_encoder is not None:
+            encode = _LatentsAt(self.objects, self.positional_encoder)
+            modules.append(TensorDictModule(encode, [key_at(at, "object_units")], [key_at(at, "positional_latent")]))
+        return modules
+
+    def pixels(self, state: Tensor, belief: Tensor) -> Tensor:
+        """Predicted images ``[..., 3, H, W]`` in [0, 1], unbounded: all instances together."""
+        return compose(*self.object_decoder(self.extractor(state, belief)))
+
+    def object_position(self) -> TensorDictModuleBase:
+        """Decoded object positions ``object_units`` ``[..., O * D]``, in workspace units."""
+        return TensorDictSequential(
+            self.object_latent(), TensorDictModule(self.position_decoder, ["object_latent"], ["object_units"])
+        )
+
+    def object_latent(self) -> TensorDictModule:
+        """Extracted object latents ``object_latent`` ``[..., O + 1, L]`` of imagined latents."""
+        return TensorDictModule(self.extractor, latent_at(("latent",)), ["object_latent"])
+
+
+class _ObjectPositions(nn.Module):
+    """Object latents ``[..., O + 1, L]`` to positions ``[..., O * D]``; the background has none."""
+
+    def __init__(self, objects: int, mlp: nn.Module) -> None:
+        super().__init__()
+        self.objects, self.mlp = objects, mlp
+
+    def forward(self, object_latent: Tensor) -> Tensor:
+        return self.mlp(object_latent[..., : self.objects, :]).flatten(-2)
+
+
+class _LatentsAt(nn.Module):
+    """Positions ``[..., O * D]`` to the latents ``[..., O, L]`` of the objects there."""
+
+    def __init__(self, objects: int, encoder: LatentPositionalEncoder) -> None:
+        super().__init__()
+        self.objects, self.encoder = objects, encoder
+
+    def forward(self, object_units: Tensor) -> Tensor:
+        return self.encoder(object_units.unflatten(-1, (self.objects, -1)))
