@@ -13,12 +13,10 @@ train() {  # folder, seed, further settings
 { train dreamer_pcp 0 agent=dreamer_pcp; train dreamer_pcp 1 agent=dreamer_pcp; } &
 { train dreamer 0 agent=dreamer; train dreamer 1 agent=dreamer; } &
 wait
-# The paper's first remedy: weigh the goal in the world model's loss. One seed.
-train dreamer_goal_200 0 agent=dreamer agent.lambda_goal_position=200
 
 checkpoints=()
 : > "$here/wall_time.txt"
-for run in dreamer/cpu/seed_0 dreamer/cpu/seed_1 dreamer_goal_200/cpu/seed_0 dreamer_pcp/cpu/seed_0 dreamer_pcp/cpu/seed_1; do
+for run in dreamer/cpu/seed_0 dreamer/cpu/seed_1 dreamer_pcp/cpu/seed_0 dreamer_pcp/cpu/seed_1; do
   file=$runs/$run/checkpoint.zip
   checkpoints+=("$file")
   name=${run//\/cpu\//_}
