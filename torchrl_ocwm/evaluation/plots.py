@@ -48,7 +48,8 @@ def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict
         runs: Name → folders of its runs, one per seed.
         metrics: Logged name → axis label, one panel each.
     """
-    figure, axes = plt.subplots(1, len(metrics), figsize=(4.2 * len(metrics), 3.2), squeeze=False)
+    size = (4.2 * len(metrics), 3.2)
+    figure, axes = plt.subplots(1, len(metrics), figsize=size, squeeze=False, layout="constrained")
     for axis, (metric, label) in zip(axes[0], metrics.items(), strict=True):
         for name, folders in runs.items():
             found = [read_scalar(folder, metric) for folder in folders]
@@ -61,6 +62,8 @@ def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict
             (line,) = axis.plot(steps, values.mean(0), label=name)
             if len(curves) > 1:
                 axis.fill_between(steps, values.min(0), values.max(0), alpha=0.2, color=line.get_color())
+        if metric.startswith("loss_model"):
+            axis.set_yscale("log")
         axis.set_xlabel("updates")
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
