@@ -20,11 +20,9 @@ import torch
 from torchrl_ocwm.envs import Reacher, make_env
 
 
-def minimum(env: Reacher) -> Callable[[], None]:
+def minimum(env: Reacher, renderer: mujoco.Renderer) -> Callable[[], None]:
     """Physics and two renders of the same model, and nothing else."""
     model, data = env.model, mujoco.MjData(env.model)
-    model.vis.quality.offsamples = 0
-    renderer = mujoco.Renderer(model, env.image_size, env.image_size)
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
 
@@ -61,8 +59,10 @@ def main() -> None:
     action = np.full(2, 0.3)
     wrapped = make_env("reacher", image_size=arguments.image_size, horizon=10**9, seed=0)
     tensordict = wrapped.reset().set("action", torch.full((2,), 0.3))
+    env.model.vis.quality.offsamples = 0
+    renderer = mujoco.Renderer(env.model, env.image_size, env.image_size)
     turns: dict[str, Callable[[], object]] = {
-        "minimum": minimum(env),
+        "minimum": minimum(env, renderer),
         "gymnasium environment": lambda: env.step(action),
         "TorchRL environment": lambda: wrapped.step(tensordict),
     }
@@ -78,6 +78,7 @@ def main() -> None:
     for name, values in times.items():
         ratio = statistics.median(low / value for low, value in zip(times["minimum"], values, strict=True))
         print(f"{name:24}{1 / statistics.median(values):10.0f}{ratio:16.2f}")
+    renderer.close()
     wrapped.close()
     env.close()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from typing import Any, ClassVar
 
@@ -148,7 +149,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         self._last_seen = np.zeros_like(self._last_seen)
         observation = self._observe(self.data)
         self._last_seen = observation["object_position"]
-        return observation, self._info(observation)
+        return observation, {"success": self._distance(observation) <= SUCCESS_DISTANCE}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict]:
         """Apply an action in [−1, 1] for ``action_repeat`` control steps; values beyond are clipped."""
@@ -162,8 +163,9 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         self._steps += 1
         observation = self._observe(self.data)
         self._last_seen = observation["object_position"]
-        reward = -self._distance(observation)  # Eq. 1
-        return observation, reward, False, self._steps >= self.horizon, self._info(observation)
+        distance = self._distance(observation)
+        success = {"success": distance <= SUCCESS_DISTANCE}
+        return observation, -distance, False, self._steps >= self.horizon, success  # Eq. 1
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """The camera image (H, W, 3) uint8, with ``render_mode="rgb_array"``."""
@@ -225,7 +227,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     def _observe(self, data: mujoco.MjData, goal: np.ndarray | None = None) -> Observation:
         goal = self._goal if goal is None else goal
         frame = self.camera.render(data, depth=self._plane is None)
-        masks = np.stack([_any_of(frame.geoms, ids) for ids in self._geom_ids])
+        masks = np.array([_any_of(frame.geoms, ids) for ids in self._geom_ids])
         world, visible = masks_to_positions(
             torch.from_numpy(masks),
             self._intrinsics,
@@ -239,7 +241,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
             "pixels": self._paint_target(frame.pixels, masks[0], goal).transpose(2, 0, 1),
             "masks": masks,
             "proprio": self._proprio(data).astype(np.float32),
-            "object_position": np.where(seen[:, None], estimate, self._last_seen),
+            "object_position": estimate if seen.all() else np.where(seen[:, None], estimate, self._last_seen),
             "object_visible": seen,
             "goal_position": goal.copy(),
             "object_position_true": self._relative(self._true_position(data)),
@@ -249,10 +251,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         return (world - self._start)[:, self._axes].astype(np.float32)
 
     def _distance(self, observation: Observation) -> float:
-        return float(np.linalg.norm(observation["object_position"][0] - observation["goal_position"]))
-
-    def _info(self, observation: Observation) -> dict[str, Any]:
-        return {"success": self._distance(observation) <= SUCCESS_DISTANCE}
+        return math.dist(observation["object_position"][0], observation["goal_position"])
 
     def _paint_target(self, pixels: np.ndarray, entity: np.ndarray, goal: np.ndarray) -> np.ndarray:
         if not self.virtual_target:
