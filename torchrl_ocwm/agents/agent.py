@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict.nn import (
@@ -49,33 +49,31 @@ class WorldModelChoice(NamedTuple):
 
 def flat_world_model(task: Task, config: AgentConfig, size: Size) -> FlatWorldModel:
     """A world model with one latent for the whole scene."""
-    return FlatWorldModel(
-        image_size=task.image_size,
-        proprio=task.proprio,
-        objects=len(task.objects),
-        action=task.action,
-        units=WorkspaceUnits(task.workspace.low, task.workspace.high),
-        observed=config.observed,
-        reward_head=config.reward == "head",
-        **size.architecture(),
-    )
+    return FlatWorldModel(**_scene(task, config, size))
 
 
 def object_world_model(task: Task, config: AgentConfig, size: Size) -> ObjectWorldModel:
     """A world model with a latent for each object (FOCUS)."""
     return ObjectWorldModel(
-        image_size=task.image_size,
-        proprio=task.proprio,
-        objects=len(task.objects),
-        action=task.action,
-        units=WorkspaceUnits(task.workspace.low, task.workspace.high),
-        observed=config.observed,
-        reward_head=config.reward == "head",
+        **_scene(task, config, size),
         positional_encoder=config.goal == "object_latent",
         object_features=size.object_features,
         extractor_units=size.extractor_units,
-        **size.architecture(),
     )
+
+
+def _scene(task: Task, config: AgentConfig, size: Size) -> dict[str, Any]:
+    """What every world model is built from."""
+    return {
+        "image_size": task.image_size,
+        "proprio": task.proprio,
+        "objects": len(task.objects),
+        "action": task.action,
+        "units": WorkspaceUnits(task.workspace.low, task.workspace.high),
+        "observed": config.observed,
+        "reward_head": config.reward == "head",
+        **size.architecture(),
+    }
 
 
 def position_goal(model: WorldModel) -> tuple[int, TensorDictModuleBase]:

@@ -168,6 +168,7 @@ class FOCUSModelLoss(WorldModelLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    _reconstructed = ("proprio", "goal_position")  # the rest is decoded object by object
 
     def __init__(
         self,

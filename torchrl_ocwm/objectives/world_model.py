@@ -117,6 +117,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    _reconstructed: tuple[str, ...] = ("pixels", "proprio", "object_position", "goal_position")
 
     def __init__(
         self,
@@ -188,7 +189,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
 
     def _reconstruction_losses(self, records: TensorDictBase) -> dict[str, Tensor]:
         losses = {}
-        for name in ("pixels", "proprio", "object_position", "goal_position"):
+        for name in self._reconstructed:
             prediction = self._next(records, getattr(self.tensor_keys, f"reco_{name}"))
             if prediction is not None:
                 target = self._next(records, getattr(self.tensor_keys, name))

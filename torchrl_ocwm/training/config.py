@@ -31,6 +31,8 @@ def recipe(folder: Path, name: str) -> Callable[[Callable[[DictConfig], None]], 
     """
 
     def decorate(function: Callable[[DictConfig], None]) -> Callable[[], None]:
+        """The script's main function."""
+
         def guarded(config: DictConfig) -> None:
             try:
                 function(config)

@@ -96,7 +96,7 @@ def _make_sampler(agent: Agent, dataset: EpisodeDataset, training: Training) -> 
     )
 
     def sample(batch: TensorDictBase | None = None) -> TensorDictBase:  # noqa: ARG001
-        return replay.sample().to(training.device)
+        return replay.sample().select(*agent.loss.in_keys, strict=False).to(training.device)
 
     return sample
 
