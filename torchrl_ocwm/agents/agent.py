@@ -24,27 +24,30 @@ from torchrl_ocwm.modules import (
     ActingLatent,
     Actor,
     FlatWorldModel,
+    FrameGoals,
+    GivenGoals,
     ImaginationEnv,
     LatentPositionalEncoder,
     LatentSimilarityReward,
+    MixedGoals,
     ObjectWorldModel,
     PositionDistanceReward,
     UniformGoals,
     WorkspaceUnits,
     WorldModel,
 )
+from torchrl_ocwm.modules.goals import GOAL
 from torchrl_ocwm.modules.networks import make_mlp
 from torchrl_ocwm.objectives import FOCUSModelLoss, GoalConditionedDreamerLoss, WorldModelLoss
 
 LAMBDA = 0.95
-GOAL: NestedKey = ("latent", "goal")
 
 
 class WorldModelChoice(NamedTuple):
     """How a world model is built, and the loss that trains it."""
 
     build: Callable[[Task, AgentConfig, Size], WorldModel]
-    loss: type[WorldModelLoss]
+    loss: Callable[[WorldModel, AgentConfig, Size], WorldModelLoss]
 
 
 def flat_world_model(task: Task, config: AgentConfig, size: Size) -> FlatWorldModel:
@@ -62,6 +65,26 @@ def object_world_model(task: Task, config: AgentConfig, size: Size) -> ObjectWor
     )
 
 
+def flat_loss(model: WorldModel, config: AgentConfig, size: Size) -> WorldModelLoss:
+    """What trains a world model with one latent."""
+    return WorldModelLoss(model.records(), **_weights(config, size))
+
+
+def object_loss(model: WorldModel, config: AgentConfig, size: Size) -> FOCUSModelLoss:
+    """What trains a world model with object latents."""
+    return FOCUSModelLoss(
+        model.records(),
+        positional_distance=config.latent_distance,
+        positional_gradient=config.positional_gradient,
+        **_weights(config, size),
+    )
+
+
+def _weights(config: AgentConfig, size: Size) -> dict[str, float]:
+    names = ("lambda_proprio", "lambda_object_position", "lambda_goal_position")
+    return {"lambda_dynamic": size.lambda_dynamic, **{name: getattr(config, name) for name in names}}
+
+
 def _scene(task: Task, config: AgentConfig, size: Size) -> dict[str, Any]:
     """What every world model is built from."""
     return {
@@ -76,36 +99,75 @@ def _scene(task: Task, config: AgentConfig, size: Size) -> dict[str, Any]:
     }
 
 
-def position_goal(model: WorldModel) -> tuple[int, TensorDictModuleBase]:
+class Goal(NamedTuple):
+    """What a goal is for policy and critic, and how it is made of what there is.
+
+    Args:
+        features: How many numbers it is.
+        position: Encodes positions ``[..., D]`` in workspace units.
+        image: Encodes images ``[..., F, 3, H, W]`` uint8, if it can be done.
+        frame: Writes ``("latent", "goal")``, the goal that a frame of the records is.
+    """
+
+    features: int
+    position: nn.Module
+    image: nn.Module | None
+    frame: TensorDictModuleBase
+
+
+def position_goal(model: WorldModel) -> Goal:
     """The goal position itself (paper, section PCP)."""
-    return model.units.dim, TensorDictModule(nn.Identity(), ["goal_units"], [GOAL])
+    objects = nn.Unflatten(-1, (-1, model.units.dim))
+    frame = TensorDictModule(nn.Sequential(objects, _First()), ["object_units"], [GOAL])
+    return Goal(model.units.dim, nn.Identity(), None, frame)
 
 
-def object_latent_goal(model: WorldModel) -> tuple[int, TensorDictModuleBase]:
+def object_latent_goal(model: WorldModel) -> Goal:
     """The latent that the object to be positioned would have at the goal (paper, section LCP)."""
-    encoder = _object_centric(model).positional_encoder
-    assert encoder is not None
-    return encoder.features, TensorDictModule(_LatentAtGoal(encoder), ["goal_units"], [GOAL])
+    model = _object_centric(model)
+    assert model.positional_encoder is not None
+    image = nn.Sequential(model.latents_in_images(), _First())
+    frame = TensorDictModule(_First(), ["image_latent"], [GOAL])
+    return Goal(model.positional_encoder.features, _LatentAtGoal(model.positional_encoder), image, frame)
 
 
-def no_goal(model: WorldModel) -> tuple[int, None]:  # noqa: ARG001
+def no_goal(model: WorldModel) -> None:
     """Nothing: the world model has to remember the goal that it observed."""
-    return 0, None
 
 
-def learned_reward(model: WorldModel) -> TensorDictModuleBase:
+def no_source(model: WorldModel, goal: Goal | None) -> None:
+    """Goals are in the observations."""
+
+
+def uniform_goals(model: WorldModel, goal: Goal) -> TensorDictModuleBase:
+    """Positions anywhere in the workspace."""
+    return TensorDictSequential(UniformGoals(model.units.dim), TensorDictModule(goal.position, ["goal_units"], [GOAL]))
+
+
+def frame_goals(model: WorldModel, goal: Goal) -> TensorDictModuleBase:  # noqa: ARG001
+    """What other frames of the batch show."""
+    return FrameGoals(goal.frame)
+
+
+def mixed_goals(model: WorldModel, goal: Goal) -> TensorDictModuleBase:
+    """Both, half and half."""
+    return MixedGoals(uniform_goals(model, goal), frame_goals(model, goal))
+
+
+def learned_reward(model: WorldModel, _: AgentConfig) -> TensorDictModuleBase:
     """What the reward head predicts."""
     return model.reward()
 
 
-def position_distance_reward(model: WorldModel) -> TensorDictModuleBase:
+def position_distance_reward(model: WorldModel, _: AgentConfig) -> TensorDictModuleBase:
     """The distance between decoded position and goal position (paper, equation 3)."""
     return TensorDictSequential(model.object_position(), PositionDistanceReward(model.units))
 
 
-def latent_similarity_reward(model: WorldModel) -> TensorDictModuleBase:
+def latent_similarity_reward(model: WorldModel, config: AgentConfig) -> TensorDictModuleBase:
     """The similarity of the object's latent and the goal latent (paper, r_LCP)."""
-    return TensorDictSequential(_object_centric(model).object_latent(), LatentSimilarityReward())
+    reward = LatentSimilarityReward(distance=config.latent_distance)
+    return TensorDictSequential(_object_centric(model).object_latent(), reward)
 
 
 def _object_centric(model: WorldModel) -> ObjectWorldModel:
@@ -116,30 +178,33 @@ def _object_centric(model: WorldModel) -> ObjectWorldModel:
 
 #: The choices by name. A new world model, goal, reward or goal source is one function and one entry here.
 WORLD_MODELS = {
-    "flat": WorldModelChoice(flat_world_model, WorldModelLoss),
-    "object": WorldModelChoice(object_world_model, FOCUSModelLoss),
+    "flat": WorldModelChoice(flat_world_model, flat_loss),
+    "object": WorldModelChoice(object_world_model, object_loss),
 }
-GOALS: dict[str, Callable[[WorldModel], tuple[int, TensorDictModuleBase | None]]] = {
+GOALS: dict[str, Callable[[WorldModel], Goal | None]] = {
     "none": no_goal,
     "position": position_goal,
     "object_latent": object_latent_goal,
 }
-REWARDS: dict[str, Callable[[WorldModel], TensorDictModuleBase]] = {
+REWARDS: dict[str, Callable[[WorldModel, AgentConfig], TensorDictModuleBase]] = {
     "head": learned_reward,
     "position_distance": position_distance_reward,
     "latent_similarity": latent_similarity_reward,
 }
-GOAL_SOURCES: dict[str, Callable[[WorldModel], TensorDictModuleBase | None]] = {
-    "environment": lambda model: None,  # noqa: ARG005
-    "uniform": lambda model: UniformGoals(model.units.dim),
+GOAL_SOURCES: dict[str, Callable[[WorldModel, Any], TensorDictModuleBase | None]] = {
+    "environment": no_source,
+    "uniform": uniform_goals,
+    "frames": frame_goals,
+    "mixed": mixed_goals,
 }
 
 
 class Policy(TensorDictSequential):
     """The policy of an agent, as a module that runs in any rollout of an environment of the agent's task.
 
-    Reads the observations, ``goal_position`` ``[..., D]`` in metres and ``is_init``; writes ``action``, and ``latent``,
-    which it reads back at the next step. Actions are drawn from the actor, or are its mean under
+    Reads the observations, ``is_init`` and a goal: ``goal_position`` ``[..., D]`` in metres as the environment gives
+    it, or a position or images under ``goal`` (:class:`~torchrl_ocwm.modules.GivenGoals`). Writes ``action``, and
+    ``latent``, which it reads back at the next step. Actions are drawn from the actor, or are its mean under
     ``set_exploration_type(ExplorationType.DETERMINISTIC)``.
 
     Attributes:
@@ -172,43 +237,40 @@ class Agent(nn.Module):
         super().__init__()
         self.task, self.config, self.size = task, config, size
         self.model = WORLD_MODELS[config.world_model].build(task, config, size)
-        goal_features, goal_encoder = GOALS[config.goal](self.model)
-        goal_source = GOAL_SOURCES[config.goal_source](self.model)
-        if (goal_source is None) != (goal_encoder is None):
+        goal = self.goal = GOALS[config.goal](self.model)
+        features = 0 if goal is None else goal.features
+        if (config.goal_source == "environment") != (goal is None):
             raise ValueError(
                 f"goal={config.goal!r} does not go with goal_source={config.goal_source!r}: a policy that sees a goal "
                 "needs goals in imagination, and only that one"
             )
-        reward = REWARDS[config.reward](self.model)
-        if (GOAL in reward.in_keys) != bool(goal_features):
+        reward = REWARDS[config.reward](self.model, config)
+        if (GOAL in reward.in_keys) != bool(features):
             raise ValueError(
                 f"reward={config.reward!r} does not go with goal={config.goal!r}: an imagined reward has to judge by "
                 "the goal that the policy sees, and by no other"
             )
-        self.goal_encoder = goal_encoder
-        self.actor = self._make_actor(goal_features)
+        self.actor = self._make_actor(features)
         self.imagination = ImaginationEnv(
             self.model.transition(),
             reward,
             state=self.model.state,
             belief=self.model.belief,
             action=task.action,
-            goal=goal_features,
+            goal=features,
         )
-        source = None if goal_source is None else TensorDictSequential(goal_source, goal_encoder)
-        self.loss = self._make_loss(self._make_critic(goal_features), source)
+        source = GOAL_SOURCES[config.goal_source](self.model, goal)
+        self.loss = self._make_loss(self._make_critic(features), source)
 
     def policy(self) -> Policy:
         """The policy, sharing the agent's parameters."""
-        model = self.model
-        goal: list[TensorDictModuleBase] = []
-        if self.goal_encoder is not None:
-            goal = [TensorDictModule(model.units, ["goal_position"], ["goal_units"]), self.goal_encoder]
+        model, goal = self.model, self.goal
+        encoder = [] if goal is None else [GivenGoals(model.units, goal.position, goal.image)]
         return Policy(
             self,
             ActingLatent(model.state, model.belief, self.task.action),
             model.filter(),
-            *goal,
+            *encoder,
             self.actor,
             # What is done is what the next step remembers.
             TensorDictModule(_clamp, ["action"], ["action"]),
@@ -253,14 +315,8 @@ class Agent(nn.Module):
     def _make_loss(
         self, critic: TensorDictSequential, goal_source: TensorDictModuleBase | None
     ) -> GoalConditionedDreamerLoss:
-        config, size = self.config, self.size
-        model_loss = WORLD_MODELS[config.world_model].loss(
-            self.model.records(),
-            lambda_dynamic=size.lambda_dynamic,
-            lambda_proprio=config.lambda_proprio,
-            lambda_object_position=config.lambda_object_position,
-            lambda_goal_position=config.lambda_goal_position,
-        )
+        size = self.size
+        model_loss = WORLD_MODELS[self.config.world_model].loss(self.model, self.config, size)
         actor_loss = DreamerV3ActorLoss(
             self.actor,
             critic,
@@ -285,6 +341,13 @@ class _LatentAtGoal(nn.Module):
 
     def forward(self, goal_units: Tensor) -> Tensor:
         return self.encoder(goal_units.unsqueeze(-2), object_index=0).squeeze(-2)
+
+
+class _First(nn.Module):
+    """What belongs to the first object, ``[..., O, any]`` to ``[..., any]``."""
+
+    def forward(self, objects: Tensor) -> Tensor:
+        return objects[..., 0, :]
 
 
 def _inputs(goal_features: int) -> list[NestedKey]:

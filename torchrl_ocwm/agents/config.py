@@ -38,8 +38,12 @@ class AgentConfig:
             or as the latent that the object would have there.
         reward: The reward in imagination: the learned head, the distance of the decoded position to the goal, or the
             similarity of the object's latent and the goal latent.
-        goal_source: Where goals in imagination come from: ``"environment"`` (in the observations), or ``"uniform"`` in
-            the workspace for each imagined start.
+        goal_source: Where goals in imagination come from: ``"environment"`` (in the observations), ``"uniform"`` in the
+            workspace for each imagined start, ``"frames"`` of the dataset, or ``"mixed"``, half of each.
+        latent_distance: How far apart two object latents are, in the reward and in training the encoder of goals: minus
+            the cosine similarity, or the mean squared error.
+        positional_gradient: What the loss of the latent positional encoder trains: the encoder, the object latents that
+            it aims at, or both.
         observed: Vectors that the world model sees and reconstructs, beside the image.
         lambda_proprio: Weight of the reconstruction of proprioception.
         lambda_object_position: Weight of the reconstruction of the object positions.
@@ -49,7 +53,9 @@ class AgentConfig:
     world_model: Literal["flat", "object"] = "flat"
     goal: Literal["none", "position", "object_latent"] = "none"
     reward: Literal["head", "position_distance", "latent_similarity"] = "head"
-    goal_source: Literal["environment", "uniform"] = "environment"
+    goal_source: Literal["environment", "uniform", "frames", "mixed"] = "environment"
+    latent_distance: Literal["cosine", "mse"] = "cosine"
+    positional_gradient: Literal["encoder", "latent", "both"] = "both"
     observed: tuple[Literal["proprio", "object_position", "goal_position"], ...] = ("proprio", "object_position")
     lambda_proprio: float = 1.0
     lambda_object_position: float = 200.0

@@ -2,10 +2,10 @@
 
 from torchrl_ocwm.modules.acting import ActingLatent
 from torchrl_ocwm.modules.actor import Actor
-from torchrl_ocwm.modules.goals import UniformGoals
+from torchrl_ocwm.modules.goals import FrameGoals, GivenGoals, MixedGoals, UniformGoals
 from torchrl_ocwm.modules.imagination import ImaginationEnv
-from torchrl_ocwm.modules.latent import InitialLatent
-from torchrl_ocwm.modules.object_world_model import ObjectWorldModel
+from torchrl_ocwm.modules.latent import InitialLatent, LatentOfImages
+from torchrl_ocwm.modules.object_world_model import LatentsInImages, ObjectWorldModel
 from torchrl_ocwm.modules.objects import LatentPositionalEncoder, ObjectDecoder, ObjectLatentExtractor
 from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.rewards import (
@@ -21,10 +21,15 @@ __all__ = [
     "ActingLatent",
     "Actor",
     "FlatWorldModel",
+    "FrameGoals",
+    "GivenGoals",
     "ImaginationEnv",
     "InitialLatent",
+    "LatentOfImages",
     "LatentPositionalEncoder",
     "LatentSimilarityReward",
+    "LatentsInImages",
+    "MixedGoals",
     "ObjectDecoder",
     "ObjectLatentExtractor",
     "ObjectWorldModel",

@@ -6,6 +6,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from torchrl_ocwm.modules.units import WorkspaceUnits
+
+GOAL: NestedKey = ("latent", "goal")
 
 
 class UniformGoals(TensorDictModuleBase):
@@ -32,3 +37,136 @@ class UniformGoals(TensorDictModuleBase):
         device = tensordict.get(self.in_keys[0]).device
         goals = 2 * torch.rand(*tensordict.batch_size, self.dim, device=device) - 1
         return tensordict.set(self.out_keys[0], goals)
+
+
+class FrameGoals(TensorDictModuleBase):
+    """Take the goal of each element of the batch from another element's frame.
+
+    Args:
+        goals: Writes the goal that a frame is, ``[*batch, G]``, from what is known of the frame.
+        goal_key: The key that it writes.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictModule
+        >>> frames = TensorDict({"frame": torch.arange(5.0).unsqueeze(-1)}, [5])
+        >>> goals = FrameGoals(TensorDictModule(nn.Identity(), ["frame"], [GOAL]))(frames)["latent", "goal"]
+        >>> goals.squeeze(-1).sort().values
+        tensor([0., 1., 2., 3., 4.])
+    """
+
+    def __init__(self, goals: TensorDictModuleBase, *, goal_key: NestedKey = GOAL) -> None:
+        super().__init__()
+        self.goals, self.goal_key = goals, goal_key
+        self.in_keys, self.out_keys = list(goals.in_keys), [goal_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        goals = self.goals(tensordict).get(self.goal_key)
+        order = torch.rand(goals.shape[:-1], device=goals.device).flatten().argsort()
+        return tensordict.set(self.goal_key, goals.flatten(0, -2)[order].reshape(goals.shape))
+
+
+class MixedGoals(TensorDictModuleBase):
+    """Draw each goal from one of two sources.
+
+    Args:
+        first: Writes goals ``[*batch, G]``.
+        second: Writes goals ``[*batch, G]``.
+        share: Probability of the second.
+        goal_key: The key that both write.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictModule
+        >>> zeros, ones = (TensorDictModule(like, ["x"], [GOAL]) for like in (torch.zeros_like, torch.ones_like))
+        >>> goals = MixedGoals(zeros, ones, share=0.3)(TensorDict({"x": torch.rand(1000, 1)}, [1000]))[GOAL]
+        >>> 200 < goals.sum() < 400
+        tensor(True)
+    """
+
+    def __init__(
+        self,
+        first: TensorDictModuleBase,
+        second: TensorDictModuleBase,
+        *,
+        share: float = 0.5,
+        goal_key: NestedKey = GOAL,
+    ) -> None:
+        super().__init__()
+        self.first, self.second, self.share, self.goal_key = first, second, share, goal_key
+        self.in_keys = list(dict.fromkeys([*first.in_keys, *second.in_keys]))
+        self.out_keys = [goal_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        first = self.first(tensordict).get(self.goal_key)
+        second = self.second(tensordict).get(self.goal_key)
+        choice = torch.rand(*first.shape[:-1], 1, device=first.device) < self.share
+        return tensordict.set(self.goal_key, torch.where(choice, second, first))
+
+
+class GivenGoals(TensorDictModuleBase):
+    """Encode the goals that a policy is given: positions or images, environment by environment.
+
+    A goal is given under ``goal``, as ``position``, as ``pixels``, or as both, of which the position counts where it
+    is not NaN. Without ``goal`` the position that the environment gives counts, ``goal_position``.
+
+    Args:
+        units: Workspace units of positions.
+        position: Encodes positions ``[..., D]`` in workspace units, to ``[..., G]``.
+        image: Encodes images ``[..., F, 3, H, W]`` uint8, to ``[..., G]``; ``None``: images are not understood.
+        goal_key: Key written, ``[*batch, G]``.
+
+    Reads ``goal_position`` ``[*batch, D]`` or ``("goal", "position")`` ``[*batch, D]``, both in metres, and
+    ``("goal", "pixels")`` ``[*batch, 3, H, W]`` or ``[*batch, F, 3, H, W]`` uint8.
+
+    Raises:
+        ValueError: when called, for an image that is not understood, or a goal that is neither.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> units = WorkspaceUnits((-0.2, -0.2), (0.2, 0.2))
+        >>> goals = GivenGoals(units, nn.Identity(), lambda pixels: pixels[..., 0, 0, 0, :2] / 255)
+        >>> given = TensorDict({
+        ...     "position": torch.tensor([[0.1, 0.0], [torch.nan, torch.nan]]),
+        ...     "pixels": torch.full((2, 3, 4, 4), 255, dtype=torch.uint8),
+        ... })
+        >>> goals(TensorDict({"goal": given}, [2]))["latent", "goal"]
+        tensor([[0.5000, 0.0000],
+                [1.0000, 1.0000]])
+    """
+
+    def __init__(
+        self,
+        units: WorkspaceUnits,
+        position: nn.Module,
+        image: nn.Module | None = None,
+        *,
+        goal_key: NestedKey = GOAL,
+    ) -> None:
+        super().__init__()
+        self.units, self.position, self.image = units, position, image
+        self.in_keys, self.out_keys = ["goal_position"], [goal_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        given = tensordict.get("goal", None)
+        position = tensordict.get("goal_position") if given is None else given.get("position", None)
+        pixels = None if given is None else given.get("pixels", None)
+        if position is None and pixels is None:
+            raise ValueError("a goal is given as 'position' or as 'pixels' under 'goal', which has neither")
+        if pixels is None:
+            goal = self.position(self.units(position))
+        else:
+            goal = self._of_images(pixels, len(tensordict.batch_size))
+            if position is not None:
+                at = position.isfinite().all(-1, keepdim=True)
+                goal = torch.where(at, self.position(self.units(position.nan_to_num())), goal)
+        return tensordict.set(self.out_keys[0], goal)
+
+    def _of_images(self, pixels: Tensor, batch_dims: int) -> Tensor:
+        if self.image is None:
+            raise ValueError("this agent takes goals as positions; goal='object_latent' takes images too")
+        if pixels.ndim == batch_dims + 3:
+            pixels = pixels.unsqueeze(-4)
+        if pixels.ndim != batch_dims + 4:
+            raise ValueError(f"goal images are [*batch, 3, H, W] or [*batch, F, 3, H, W], got {tuple(pixels.shape)}")
+        return self.image(pixels)

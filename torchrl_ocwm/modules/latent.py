@@ -1,11 +1,13 @@
-"""The latent state at the start of a sequence."""
+"""The latent state at the start of a sequence, and of images without one."""
 
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.modules import RSSMPosteriorV3, RSSMPriorV3, RSSMStateEstimatorV3
 
 
 class InitialLatent(TensorDictModuleBase):
@@ -43,3 +45,41 @@ class InitialLatent(TensorDictModuleBase):
             if tensordict.get(key, None) is None:
                 tensordict.set(key, torch.zeros(1, device=device).expand(*tensordict.batch_size, size))
         return tensordict
+
+
+class LatentOfImages(nn.Module):
+    """The latent state after images that are all there is: no vectors, no actions (paper, "Visual targets").
+
+    It starts from zero and takes in one image after the other, each after an action of zero, so that a single image is
+    seen as the first frame of an episode.
+
+    Args:
+        prior: Advances the belief.
+        posterior: Samples the state.
+        state: Features of the stochastic state S.
+        belief: Features of the deterministic state H.
+        action: Number of actions A.
+
+    Called with embeddings ``[..., F, E]`` of F images; returns state ``[..., S]`` and belief ``[..., H]``.
+
+    Examples:
+        >>> from torchrl_ocwm.agents import build_agent
+        >>> from torchrl_ocwm.testing import reacher_task
+        >>> model = build_agent("focus_lcp", reacher_task(), size="debug").model
+        >>> state, belief = model.latent_of_images()(torch.zeros(3, 2, model.encoder.features))
+        >>> state.shape, belief.shape
+        (torch.Size([3, 16]), torch.Size([3, 16]))
+    """
+
+    def __init__(self, prior: RSSMPriorV3, posterior: RSSMPosteriorV3, *, state: int, belief: int, action: int) -> None:
+        super().__init__()
+        self.sizes = {"state": state, "belief": belief, "previous_action": action}
+        self.estimator = RSSMStateEstimatorV3(prior, posterior)
+
+    def forward(self, embeddings: Tensor) -> tuple[Tensor, Tensor]:
+        shape = embeddings.shape[:-2]
+        latent = TensorDict({name: embeddings.new_zeros(*shape, size) for name, size in self.sizes.items()}, shape)
+        latent["is_init"] = torch.zeros(*shape, 1, dtype=torch.bool, device=embeddings.device)
+        for embedding in embeddings.unbind(-2):
+            latent = self.estimator(latent.set("encoded_latents", embedding))
+        return latent["state"], latent["belief"]

@@ -7,8 +7,10 @@ from typing import Any
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 
+from torchrl_ocwm.modules.latent import LatentOfImages
 from torchrl_ocwm.modules.networks import Style, make_mlp
 from torchrl_ocwm.modules.objects import LatentPositionalEncoder, ObjectDecoder, ObjectLatentExtractor, compose
+from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.world_model import VectorName, WorldModel, key_at, latent_at
 
 
@@ -104,15 +106,32 @@ class ObjectWorldModel(WorldModel):
         return modules
 
     def images(self, *at: str) -> list[TensorDictModuleBase]:
-        """``reco_object_pixels`` and ``mask_logits``; with a positional encoder ``positional_latent`` too."""
+        """``reco_object_pixels`` and ``mask_logits``."""
         out = [key_at(at, "reco_object_pixels"), key_at(at, "mask_logits")]
-        modules: list[TensorDictModuleBase] = [
-            TensorDictModule(self.object_decoder, [key_at(at, "object_latent")], out)
-        ]
-        if self.positional_encoder is not None:
-            encode = _LatentsAt(self.objects, self.positional_encoder)
-            modules.append(TensorDictModule(encode, [key_at(at, "object_units")], [key_at(at, "positional_latent")]))
-        return modules
+        return [TensorDictModule(self.object_decoder, [key_at(at, "object_latent")], out)]
+
+    def records(self) -> TensorDictSequential:
+        """Posterior, prior and predictions for records ``[B, T]``; everything is read and written under ``next``.
+
+        With a positional encoder also the two latents that goals are made of: ``positional_latent`` ``[B, T, O, L]``
+        of the true positions, and ``image_latent`` ``[B, T, O + 1, L]`` of each image alone with the positions
+        ``reco_image_units`` ``[B, T, O * D]`` in it.
+        """
+        records = super().records()
+        if self.positional_encoder is None:
+            return records
+        encode = _LatentsAt(self.objects, self.positional_encoder)
+        image, at_image = ("next", "image_latent"), ("next", "reco_image_units")
+        return TensorDictSequential(
+            records,
+            TensorDictModule(encode, [("next", "object_units")], [("next", "positional_latent")]),
+            TensorDictModule(_LatentsInEmbedding(self.latents_in_images()), [("next", "encoded_latents")], [image]),
+            TensorDictModule(self.position_decoder, [image], [at_image]),
+        )
+
+    def latents_in_images(self) -> LatentsInImages:
+        """Object latents ``[..., O + 1, L]`` of what images ``[..., F, 3, H, W]`` uint8 show, one after the other."""
+        return LatentsInImages(self.encoder, self.latent_of_images(), self.extractor)
 
     def pixels(self, state: Tensor, belief: Tensor) -> Tensor:
         """Predicted images ``[..., 3, H, W]`` in [0, 1], unbounded: all instances together."""
@@ -127,6 +146,37 @@ class ObjectWorldModel(WorldModel):
     def object_latent(self) -> TensorDictModule:
         """Extracted object latents ``object_latent`` ``[..., O + 1, L]`` of imagined latents."""
         return TensorDictModule(self.extractor, latent_at(("latent",)), ["object_latent"])
+
+
+class LatentsInImages(nn.Module):
+    """Object latents of images that are all there is: encoder and posterior, then extractor (paper, "Visual targets").
+
+    Args:
+        encoder: Embeds the images, without vectors.
+        latent: Takes the embeddings in, one after the other.
+        extractor: Extracts the object latents.
+
+    Called with images ``[..., F, 3, H, W]`` uint8; returns ``[..., O + 1, L]``.
+    """
+
+    def __init__(self, encoder: ObservationEncoder, latent: LatentOfImages, extractor: ObjectLatentExtractor) -> None:
+        super().__init__()
+        self.encoder, self.latent, self.extractor = encoder, latent, extractor
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        return self.extractor(*self.latent(self.encoder(pixels)))
+
+
+class _LatentsInEmbedding(nn.Module):
+    """Object latents ``[..., O + 1, L]`` of single images, from the embeddings ``[..., E]`` of images and vectors."""
+
+    def __init__(self, images: LatentsInImages) -> None:
+        super().__init__()
+        self.images = images
+
+    def forward(self, embedding: Tensor) -> Tensor:
+        alone = self.images.encoder.image_alone(embedding)
+        return self.images.extractor(*self.images.latent(alone.unsqueeze(-2)))
 
 
 class _ObjectPositions(nn.Module):

@@ -88,8 +88,8 @@ class ObjectDecoder(nn.Module):
         self.cnn = make_image_decoder(style, features, image_size, depth=cnn_depth, mults=cnn_mults, channels=4)
 
     def forward(self, object_latent: Tensor) -> tuple[Tensor, Tensor]:
-        image = self.cnn(object_latent)
-        return image[..., :3, :, :], image[..., 3, :, :]
+        colours, mask_logits = self.cnn(object_latent).split([3, 1], -3)
+        return colours, mask_logits.squeeze(-3)
 
 
 def compose(colours: Tensor, mask_logits: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 from torchrl.objectives import symlog
 
 from torchrl_ocwm.modules.networks import Style, make_image_encoder, make_mlp
@@ -22,7 +23,7 @@ class ObservationEncoder(nn.Module):
         style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
 
     Called with ``pixels`` ``[..., 3, H, W]`` uint8 and vectors ``[..., any]`` float32; returns
-    ``[..., features]`` float32.
+    ``[..., features]`` float32. Without vectors their part of the embedding is zero (:meth:`image_alone`).
 
     Raises:
         ValueError: if the image cannot be halved by every stage; when called, for inputs of other shapes.
@@ -47,7 +48,7 @@ class ObservationEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.cnn, self.features = make_image_encoder(style, image_size, depth=cnn_depth, mults=cnn_mults)
-        self.image_size, self.vector_features = image_size, vector_features
+        self.image_size, self.vector_features, self.mlp_units = image_size, vector_features, mlp_units
         self.mlp = None
         if vector_features:
             self.mlp = make_mlp(style, vector_features, None, layers=mlp_layers, units=mlp_units)
@@ -58,12 +59,19 @@ class ObservationEncoder(nn.Module):
         image = self.cnn(pixels)
         if self.mlp is None:
             return image
+        if not vectors:
+            return pad(image, (0, self.features - image.shape[-1]))
         return torch.cat([image, self.mlp(symlog(torch.cat(vectors, -1)))], -1)
+
+    def image_alone(self, embedding: Tensor) -> Tensor:
+        """Embeddings ``[..., features]`` of image and vectors to those that the images have without vectors."""
+        vectors = 0 if self.mlp is None else self.mlp_units
+        return pad(embedding[..., : self.features - vectors], (0, vectors))
 
     def _check(self, pixels: Tensor, vectors: tuple[Tensor, ...]) -> None:
         expected = (3, self.image_size, self.image_size)
         if pixels.shape[-3:] != expected:
             raise ValueError(f"this model takes images of shape (..., *{expected}), got {tuple(pixels.shape)}")
-        if sum(vector.shape[-1] for vector in vectors) != self.vector_features:
+        if vectors and sum(vector.shape[-1] for vector in vectors) != self.vector_features:
             shapes = [tuple(vector.shape) for vector in vectors]
             raise ValueError(f"this model takes vectors of {self.vector_features} values in all, got shapes {shapes}")

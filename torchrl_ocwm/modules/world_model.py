@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.modules import RSSMRolloutV3, RSSMStateEstimatorV3, SymExpTwoHot
 
-from torchrl_ocwm.modules.latent import InitialLatent
+from torchrl_ocwm.modules.latent import InitialLatent, LatentOfImages
 from torchrl_ocwm.modules.networks import Style, make_image_decoder, make_mlp, make_rssm
 from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.units import WorkspaceUnits
@@ -213,6 +213,10 @@ class WorldModel(nn.Module, ABC):
             out_keys=latent,
         )
         return TensorDictSequential(*self._encode(), estimator)
+
+    def latent_of_images(self) -> LatentOfImages:
+        """State and belief after images that are all there is: a goal, say."""
+        return LatentOfImages(self.prior, self.posterior, state=self.state, belief=self.belief, action=self.action)
 
 
 class FlatWorldModel(WorldModel):

@@ -23,7 +23,8 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
         model_loss: Loss of the world model, returning its outputs with gradients (``detach_output=False``).
         actor_loss: Imagines and trains the actor; its keys ``state`` and ``belief`` are set to ``"latent"`` here.
         value_loss: Trains the critic on the same imagined trajectories.
-        goal_source: Reads ``latent = {state, belief}`` ``[B * T]`` and writes ``("latent", "goal")``.
+        goal_source: Reads ``latent = {state, belief}`` ``[B * T]``, and what else it names of the records of these
+            states, and writes ``("latent", "goal")``.
         replay_value_loss_weight: Weight of TorchRL's critic loss on the recorded rewards; these belong to the goals
             of the records, so that it needs an agent without a goal source.
         continuation_horizon: Discount horizon of that term, steps.
@@ -85,20 +86,27 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
             {"state": after.get(self.tensor_keys.state), "belief": after.get(self.tensor_keys.belief)},
             sample.batch_size,
         )
-        actor_losses, imagined = self.actor_loss(self.imagination_start(latent))
+        actor_losses, imagined = self.actor_loss(self.imagination_start(latent, after))
         value_losses, _ = self.value_loss(imagined.detach())
         losses = model_losses.update(actor_losses).update(value_losses)
         if self.replay_value_loss_weight:
             losses["loss_replay_value"] = self.replay_value_loss_weight * self._replay_value(sample, latent, imagined)
         return losses.set(self.tensor_keys.replay_context, latent.detach())
 
-    def imagination_start(self, latent: TensorDictBase) -> TensorDictBase:
-        """Start states ``[B * T]`` with goals, from posterior states and beliefs ``[B, T]``; without gradients."""
+    def imagination_start(self, latent: TensorDictBase, records: TensorDictBase) -> TensorDictBase:
+        """Start states ``[B * T]`` with goals, without gradients.
+
+        Args:
+            latent: Posterior states and beliefs ``[B, T]``.
+            records: What the goal source reads of the frames ``[B, T]`` of these states.
+        """
         start = TensorDict({"latent": latent.detach().reshape(-1)}, [latent.numel()])
         if self.goal_source is None:
             return start
+        frames = [key for key in self.goal_source.in_keys if key not in start.keys(True)]
+        start.update(records.select(*frames).detach().reshape(-1))
         with torch.no_grad():
-            return self.goal_source(start)
+            return self.goal_source(start).select("latent")
 
     def _replay_value(self, sample: TensorDictBase, latent: TensorDictBase, imagined: TensorDictBase):  # type: ignore[no-untyped-def]
         keys = self.value_loss.tensor_keys

@@ -64,8 +64,11 @@ def object_reconstruction(colours: Tensor, pixels: Tensor, masks: Tensor) -> Ten
         >>> object_reconstruction(colours, pixels, torch.tensor([[[[True, False]]]]))
         tensor(3.7500)
     """
-    error = (colours.float() - pixels.unsqueeze(-4).float() / 255).square()
-    return (error * instance_masks(masks).unsqueeze(-3)).sum((-4, -3, -2, -1)).mean()
+    true = instance_masks(masks)
+    # No pixel belongs to two instances, so that one squared error per pixel is enough.
+    predicted = (colours.float() * true.unsqueeze(-3)).sum(-4)
+    error = (predicted - pixels.float() / 255 * true.any(-3).unsqueeze(-3)).square()
+    return error.sum((-3, -2, -1)).mean()
 
 
 def visible_position_reconstruction(prediction: Tensor, target: Tensor, visible: Tensor) -> Tensor:
@@ -92,7 +95,7 @@ def positional_latent_loss(
     visible: Tensor,
     *,
     distance: Literal["cosine", "mse"] = "cosine",
-    gradient: Literal["encoder", "latent", "both"] = "encoder",
+    gradient: Literal["encoder", "latent", "both"] = "both",
 ) -> Tensor:
     """How far latents encoded from positions are from those of the objects there, averaged over the batch (L_pos).
 
@@ -130,6 +133,8 @@ class FOCUSModelLoss(WorldModelLoss):
         lambda_masks: Weight of the masks, −log p summed over the image.
         lambda_object_pixels: Weight of the colours inside the true masks, squared error summed over the image.
         lambda_positional: Weight of L_pos.
+        lambda_image_latent: Weight of what makes an image alone a goal: the position in it, weighted like the object
+            positions too, and minus the cosine similarity of its object latents and those of the whole observation.
         positional_distance: ``"cosine"`` or ``"mse"``.
         positional_gradient: What L_pos trains: ``"encoder"``, ``"latent"`` or ``"both"``.
         kwargs: The arguments of :class:`~torchrl_ocwm.objectives.WorldModelLoss`.
@@ -157,6 +162,10 @@ class FOCUSModelLoss(WorldModelLoss):
             object_latent (NestedKey): Extracted latents, ``[B, T, O + 1, L]``. Defaults to ``"object_latent"``.
             positional_latent (NestedKey): Latents encoded from positions, ``[B, T, O, L]``. Defaults to
                 ``"positional_latent"``.
+            image_latent (NestedKey): Latents of each image alone, ``[B, T, O + 1, L]``. Defaults to
+                ``"image_latent"``.
+            reco_image_position (NestedKey): Positions decoded from these, ``[B, T, O * D]``. Defaults to
+                ``"reco_image_units"``.
         """
 
         masks: NestedKey = "masks"
@@ -165,6 +174,8 @@ class FOCUSModelLoss(WorldModelLoss):
         object_visible: NestedKey = "object_visible"
         object_latent: NestedKey = "object_latent"
         positional_latent: NestedKey = "positional_latent"
+        image_latent: NestedKey = "image_latent"
+        reco_image_position: NestedKey = "reco_image_units"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -177,13 +188,14 @@ class FOCUSModelLoss(WorldModelLoss):
         lambda_masks: float = 1.0,
         lambda_object_pixels: float = 1.0,
         lambda_positional: float = 1.0,
+        lambda_image_latent: float = 1.0,
         positional_distance: Literal["cosine", "mse"] = "cosine",
-        positional_gradient: Literal["encoder", "latent", "both"] = "encoder",
+        positional_gradient: Literal["encoder", "latent", "both"] = "both",
         **kwargs: Any,
     ) -> None:
         super().__init__(world_model, **kwargs)
         self.lambda_masks, self.lambda_object_pixels = lambda_masks, lambda_object_pixels
-        self.lambda_positional = lambda_positional
+        self.lambda_positional, self.lambda_image_latent = lambda_positional, lambda_image_latent
         self.positional_distance: Literal["cosine", "mse"] = positional_distance
         self.positional_gradient: Literal["encoder", "latent", "both"] = positional_gradient
 
@@ -206,15 +218,26 @@ class FOCUSModelLoss(WorldModelLoss):
         losses["loss_model_masks"] = self.lambda_masks * masks_error
         losses["loss_model_object_pixels"] = self.lambda_object_pixels * colours_error
         losses["loss_model_object_position"] = self.lambda_object_position * position_error
-        predicted = self._next(records, keys.positional_latent)
+        losses.update(self._goal_latent_losses(records, visible))
+        return losses
+
+    def _goal_latent_losses(self, records: TensorDictBase, visible: Tensor) -> dict[str, Tensor]:
+        """What the two kinds of goals are encoded with: of a position, and of an image alone."""
+        keys, losses = self.tensor_keys, {}
+        predicted, alone = self._next(records, keys.positional_latent), self._next(records, keys.image_latent)
+        latent = self._next(records, keys.object_latent)[..., :-1, :]
         if predicted is not None:
-            extracted = self._next(records, keys.object_latent)[..., :-1, :]
             error = positional_latent_loss(
-                predicted,
-                extracted,
-                visible,
-                distance=self.positional_distance,
-                gradient=self.positional_gradient,
+                predicted, latent, visible, distance=self.positional_distance, gradient=self.positional_gradient
             )
             losses["loss_model_positional"] = self.lambda_positional * error  # L_pos
+        if alone is not None:
+            error = positional_latent_loss(
+                alone[..., :-1, :], latent, visible, distance=self.positional_distance, gradient="encoder"
+            )
+            losses["loss_model_image_latent"] = self.lambda_image_latent * error
+            error = visible_position_reconstruction(
+                self._next(records, keys.reco_image_position), self._next(records, keys.object_position), visible
+            )
+            losses["loss_model_image_position"] = self.lambda_image_latent * self.lambda_object_position * error
         return losses
