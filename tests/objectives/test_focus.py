@@ -107,12 +107,53 @@ def moved(module: nn.Module) -> bool:
     return any(float(p.grad.abs().sum()) > 0 for p in module.parameters() if p.grad is not None)
 
 
-def test_l_pos_moves_the_positional_encoder_and_nothing_else(make_agent: Any, records: TensorDict) -> None:
-    agent = make_agent("focus_lcp")
+def reached(agent: Any) -> set[str]:
+    return {name for name, child in agent.model.named_children() if moved(child)}
+
+
+BODY = {"encoder", "prior", "posterior", "extractor"}
+
+
+@pytest.mark.parametrize(
+    ("gradient", "parts"),
+    [("encoder", {"positional_encoder"}), ("latent", BODY), ("both", BODY | {"positional_encoder"})],
+)
+def test_l_pos_moves_what_it_should_and_nothing_else(
+    make_agent: Any, records: TensorDict, gradient: str, parts: set[str]
+) -> None:
+    agent = make_agent("focus_lcp", positional_gradient=gradient)
     agent.loss.model_loss(records)[0]["loss_model_positional"].backward()
-    assert moved(agent.model.positional_encoder)
-    others = [child for name, child in agent.model.named_children() if name != "positional_encoder"]
-    assert not any(map(moved, others))
+    assert reached(agent) == parts
+
+
+@pytest.mark.parametrize(("part", "parts"), [("latent", BODY), ("position", BODY | {"position_decoder"})])
+def test_what_images_alone_train(make_agent: Any, records: TensorDict, part: str, parts: set[str]) -> None:
+    agent = make_agent("focus_lcp")
+    agent.loss.model_loss(records)[0][f"loss_model_image_{part}"].backward()
+    assert reached(agent) == parts
+    assert not moved(agent.model.encoder.mlp)  # no vectors
+
+
+@pytest.mark.usefixtures("no_noise")
+def test_image_losses_frame_by_frame(make_agent: Any, records: TensorDict) -> None:
+    agent = make_agent("focus_lcp", lambda_object_position=7.0)
+    records["next", "object_visible"][1, 2] = False
+    losses, after = agent.loss.model_loss(records)
+    model, latents, positions = agent.model, [], []
+    for frame in range(12):
+        where = divmod(frame, 6)
+        embedding = model.encoder(records["next", "pixels"][where][None])  # zeros for the vectors
+        belief = model.prior._update_belief(*(torch.zeros(1, n) for n in (model.state, model.belief, model.action)))
+        latent = model.extractor(model.posterior(belief, embedding)[1], belief)[0]
+        torch.testing.assert_close(after["next", "image_latent"][where], latent)
+        if where != (1, 2):
+            target = after["next", "object_latent"][where][0]
+            latents.append(-torch.dot(latent[0], target) / latent[0].norm() / target.norm())
+            true = records["next", "object_position"][where][0] / 0.24
+            symlog = [torch.sign(x) * torch.log(1 + x.abs()) for x in (model.position_decoder.mlp(latent[0]), true)]
+            positions.append((symlog[0] - symlog[1]).square().sum())
+    torch.testing.assert_close(losses["loss_model_image_latent"], torch.stack(latents).sum() / 12)
+    torch.testing.assert_close(losses["loss_model_image_position"], 7 * torch.stack(positions).sum() / 12)
 
 
 @pytest.mark.parametrize("name", ["focus", "focus_pcp", "focus_lcp"])
@@ -128,9 +169,7 @@ def test_policy_losses_leave_model_and_encoder_alone(make_agent: Any, records: T
 def test_object_terms_train_the_rssm(make_agent: Any, records: TensorDict, part: str) -> None:
     agent = make_agent("focus")
     agent.loss.model_loss(records)[0][f"loss_model_{part}"].backward()
-    reached = {name for name, child in agent.model.named_children() if moved(child)}
-    decoder = "position_decoder" if part == "object_position" else "object_decoder"
-    assert reached == {"prior", "posterior", "encoder", "extractor", decoder}
+    assert reached(agent) == BODY | {"position_decoder" if part == "object_position" else "object_decoder"}
 
 
 def test_latent_reward_teaches_the_actor_through_the_dynamics(make_agent: Any, records: TensorDict) -> None:
@@ -175,8 +214,8 @@ def test_weights_and_keys(make_agent: Any, records: TensorDict) -> None:
 @pytest.mark.usefixtures("no_noise")
 def test_update_of_lcp_compiles_into_one_graph(make_agent: Any, records: TensorDict) -> None:
     records = records[:, :3]
-    expected = make_agent("focus_lcp").loss(records)
-    loss = make_agent("focus_lcp").loss
+    expected = make_agent("focus_lcp", goal_source="mixed").loss(records)
+    loss = make_agent("focus_lcp", goal_source="mixed").loss
     losses = torch.compile(lambda batch: loss(batch), fullgraph=True, backend="eager")(records)
     for key in expected.keys(True, True):
         torch.testing.assert_close(losses[key], expected[key], msg=str(key))

@@ -86,27 +86,28 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
             {"state": after.get(self.tensor_keys.state), "belief": after.get(self.tensor_keys.belief)},
             sample.batch_size,
         )
-        actor_losses, imagined = self.actor_loss(self.imagination_start(latent, after))
+        actor_losses, imagined = self.actor_loss(self.imagination_start(after))
         value_losses, _ = self.value_loss(imagined.detach())
         losses = model_losses.update(actor_losses).update(value_losses)
         if self.replay_value_loss_weight:
             losses["loss_replay_value"] = self.replay_value_loss_weight * self._replay_value(sample, latent, imagined)
         return losses.set(self.tensor_keys.replay_context, latent.detach())
 
-    def imagination_start(self, latent: TensorDictBase, records: TensorDictBase) -> TensorDictBase:
+    def imagination_start(self, frames: TensorDictBase) -> TensorDictBase:
         """Start states ``[B * T]`` with goals, without gradients.
 
         Args:
-            latent: Posterior states and beliefs ``[B, T]``.
-            records: What the goal source reads of the frames ``[B, T]`` of these states.
+            frames: ``[B, T]`` with posterior states, beliefs and what else the goal source reads.
         """
-        start = TensorDict({"latent": latent.detach().reshape(-1)}, [latent.numel()])
+        frames = frames.detach().reshape(-1)
+        keys = self.tensor_keys
+        latent = TensorDict({"state": frames.get(keys.state), "belief": frames.get(keys.belief)}, frames.batch_size)
+        start = TensorDict({"latent": latent}, frames.batch_size)
         if self.goal_source is None:
             return start
-        frames = [key for key in self.goal_source.in_keys if key not in start.keys(True)]
-        start.update(records.select(*frames).detach().reshape(-1))
+        known = [key for key in self.goal_source.in_keys if key not in start.keys(True)]
         with torch.no_grad():
-            return self.goal_source(start).select("latent")
+            return self.goal_source(start.update(frames.select(*known)))
 
     def _replay_value(self, sample: TensorDictBase, latent: TensorDictBase, imagined: TensorDictBase):  # type: ignore[no-untyped-def]
         keys = self.value_loss.tensor_keys
