@@ -16,7 +16,7 @@ from torchrl_ocwm import load_agent
 from torchrl_ocwm.agents import Policy, agent_name
 from torchrl_ocwm.data import SmoothRandomPolicy
 from torchrl_ocwm.envs import ENVIRONMENTS, Task
-from torchrl_ocwm.evaluation import EvaluationEnvs, ReconstructionError, Report, measure
+from torchrl_ocwm.evaluation import EvaluationEnvs, ReconstructionError, Report, goal_images, measure
 from torchrl_ocwm.evaluation.plots import heatmap, learning_curves
 from torchrl_ocwm.evaluation.videos import imagined_rollout, mark, tile, write_video
 from torchrl_ocwm.training.config import recipe
@@ -37,6 +37,7 @@ def main(config: DictConfig) -> None:
     if size * size != config.goals or size < 1:
         raise ValueError(f"goals={config.goals} is not a square grid; try {size * size}")
     goals = task.workspace.grid(size).flatten(0, 1)
+    images = goal_images(task, goals) if config.image_goals else None
     output = Path(config.output)
     report = Report(goals, {key: config[key] for key in ("goals", "episode_steps", "seed")})
     torch.manual_seed(config.seed)
@@ -47,17 +48,24 @@ def main(config: DictConfig) -> None:
         if config.random:
             report.add("random", measure(envs.run(SmoothRandomPolicy(task.action), goals)), source="smooth actions")
         for policy, file in zip(policies, files, strict=True):
-            report.add(agent_name(policy.agent.config), _evaluate(policy, envs, goals, config.seed), source=str(file))
+            name = agent_name(policy.agent.config)
+            report.add(name, _evaluate(policy, envs, goals, config.seed), source=str(file))
+            if images is not None and policy.takes_images:
+                seen = _evaluate(policy, envs, goals, config.seed, images)
+                report.add(f"{name}, image goals", seen, source=str(file))
         report.save(output)
         heatmap(output / "heatmap.png", report.per_goal("final_score"), task.workspace, title="final score")
         if config.video_goals:
-            _film(policies[-1], envs, goals, config.video_goals, output / "episodes.mp4")
+            chosen = torch.linspace(0, len(goals) - 1, config.video_goals).round().long()
+            _film(policies[-1], envs, goals[chosen], output / "episodes.mp4")
+            if images is not None and policies[-1].takes_images:
+                _film(policies[-1], envs, goals[chosen], output / "episodes_image_goals.mp4", images[chosen])
     runs: dict[str, list[Path]] = {}
     for policy, file in zip(policies, files, strict=True):
         runs.setdefault(agent_name(policy.agent.config), []).append(file.parent)
     learning_curves(output / "learning_curve.png", runs, CURVES)
     print(report.markdown())
-    print(f"\ntable, numbers, heatmap.png, learning_curve.png, episodes.mp4: {output}")
+    print(f"\ntable, numbers, heatmap, learning curve, videos: {output}")
 
 
 def _one_task(policies: list[Policy], files: list[Path]) -> Task:
@@ -68,21 +76,29 @@ def _one_task(policies: list[Policy], files: list[Path]) -> Task:
     return tasks[0]
 
 
-def _evaluate(policy: Policy, envs: EvaluationEnvs, goals: Tensor, seed: int) -> dict[str, Tensor]:
-    episodes = envs.run(policy, goals, seed=seed, inspect=ReconstructionError(policy.agent), progress=True)
+def _evaluate(
+    policy: Policy, envs: EvaluationEnvs, goals: Tensor, seed: int, images: Tensor | None = None
+) -> dict[str, Tensor]:
+    inspect = ReconstructionError(policy.agent)
+    episodes = envs.run(policy, goals, images=images, seed=seed, inspect=inspect, progress=True)
     errors = {name: episodes[name].mean(1) for name in ("entity_error", "goal_error") if name in episodes}
     return {**measure(episodes), **errors}
 
 
-def _film(policy: Policy, envs: EvaluationEnvs, goals: Tensor, count: int, file: Path) -> None:
-    """Above: what happened, the goal as a cross. Below: what the agent imagined would happen, from the first frame."""
+def _film(policy: Policy, envs: EvaluationEnvs, goals: Tensor, file: Path, images: Tensor | None = None) -> None:
+    """What happened, the goal as a cross; below, what the agent imagined would happen, from the first frame.
+
+    Above both the goal image, where the agent was given one.
+    """
     task = policy.agent.task
-    chosen = goals[torch.linspace(0, len(goals) - 1, count).round().long()]
-    episodes = envs.run(policy, chosen, keep=("pixels",), inspect=lambda step: {"latent": step["latent"]})
+    episodes = envs.run(policy, goals, images=images, keep=("pixels",), inspect=lambda step: {"latent": step["latent"]})
     imagined = imagined_rollout(policy.agent, episodes["latent"][:, 0], envs.episode_steps)
     with gymnasium.make(ENVIRONMENTS[task.name].id, **task.options) as env:
-        points = torch.as_tensor(env.unwrapped.project(chosen.numpy()))
-    write_video(file, tile([mark(episodes["pixels"], points), mark(imagined, points)]))
+        points = torch.as_tensor(env.unwrapped.project(goals.numpy()))
+    rows = [mark(episodes["pixels"], points), mark(imagined, points)]
+    if images is not None:
+        rows.insert(0, images.unsqueeze(1).expand_as(rows[0]))
+    write_video(file, tile(rows))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,7 +13,7 @@ from torch import Tensor
 
 from torchrl_ocwm.agents import build_agent
 from torchrl_ocwm.envs import Task, make_task
-from torchrl_ocwm.evaluation import EvaluationEnvs, LandmarkEvaluation, ReconstructionError
+from torchrl_ocwm.evaluation import EvaluationEnvs, LandmarkEvaluation, ReconstructionError, goal_images
 from torchrl_ocwm.testing import reacher_task
 
 
@@ -68,6 +70,33 @@ def test_goals_reach_the_environments_of_every_process(task: Task) -> None:
     assert episodes["pixels"].shape == (4, 5, 3, 64, 64)
     distance = (episodes["object_position"][:, -1, 0] - goals(task, 4)).norm(dim=-1)
     torch.testing.assert_close(episodes["reward"][:, -1, 0], -distance)  # each environment had its own goal
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_each_environment_keeps_its_goal_image(task: Task, workers: int) -> None:
+    places = goals(task, 3)
+    images = goal_images(task, places)
+    seen = []
+
+    def look(tensordict: TensorDictBase) -> TensorDictBase:
+        seen.append(tensordict["goal", "pixels"].clone())
+        return push(tensordict)
+
+    with EvaluationEnvs(task, episode_steps=3, workers=workers, envs=2) as envs:
+        envs.run(look, places, images=images)
+    full = images[[0, 1, 2, 2]].split(max(workers, 1) * 2)
+    for step, given in enumerate(seen):
+        torch.testing.assert_close(given.flatten(0, 1), full[step // 3], rtol=0, atol=0)
+
+
+def test_goal_images_show_the_object_at_the_goal(task: Task) -> None:
+    places = goals(task, 3)
+    with gymnasium.make("ocwm/Reacher-v0") as env:
+        env.reset(seed=5)
+        for place, image in zip(places, goal_images(task, places), strict=True):
+            there = env.unwrapped.goal_observation(place.numpy())
+            assert np.linalg.norm(there["object_position_true"][0] - place.numpy()) < 0.005
+            np.testing.assert_array_equal(there["pixels"], image)
 
 
 def test_goals_are_checked(envs: EvaluationEnvs) -> None:

@@ -45,9 +45,9 @@ def train(dataset: Path, output: Path, *arguments: str) -> Path:
 
 def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     files = [train(dataset, tmp_path / "pcp", "agent=dreamer_pcp", "training.loggers=[tensorboard]")]
-    files.append(train(dataset, tmp_path / "lcp", "agent=focus_lcp"))
     for seed in (0, 1):
         files.append(train(dataset, tmp_path / f"dreamer_{seed}", "agent=dreamer", f"training.seed={seed}"))
+    files.append(train(dataset, tmp_path / "lcp", "agent=focus_lcp"))
     assert (tmp_path / "pcp" / "videos" / "open_loop_0000004.mp4").stat().st_size > 1000
     assert list((tmp_path / "pcp" / "tensorboard").iterdir())
     assert (tmp_path / "pcp" / ".hydra" / "config.yaml").exists()
@@ -61,18 +61,25 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
         "workers=0",
         "envs=4",
         "video_goals=2",
+        "image_goals=true",
         f"output={output}",
     )
     table = (output / "results.md").read_text()
     assert table in printed
     rows = [line.split(" | ") for line in table.splitlines()[2:]]
-    assert [row[0] for row in rows] == ["| random", "| dreamer_pcp", "| focus_lcp", "| dreamer"]
-    assert [row[1] for row in rows] == ["1", "1", "1", "2"]
+    assert [row[0] for row in rows] == [
+        "| random",
+        "| dreamer_pcp",
+        "| dreamer",
+        "| focus_lcp",
+        "| focus_lcp, image goals",
+    ]
+    assert [row[1] for row in rows] == ["1", "1", "2", "1", "1"]
     assert rows[1][-1].startswith("–")  # PCP's world model does not know the goal
-    assert "±" in rows[3][-1]
+    assert "±" in rows[2][-1]
     results = json.loads((output / "results.json").read_text())
     assert len(results["agents"]["dreamer"]["per_goal"][0]["final_score"]) == 4
-    for name in ("heatmap.png", "learning_curve.png", "episodes.mp4"):
+    for name in ("heatmap.png", "learning_curve.png", "episodes.mp4", "episodes_image_goals.mp4"):
         assert (output / name).stat().st_size > 1000, name
     assert torchrl_ocwm.load_agent(files[0]).agent.config.goal == "position"
 

@@ -209,11 +209,17 @@ class Policy(TensorDictSequential):
 
     Attributes:
         agent: The agent that it belongs to.
+        takes_images: Whether goals can be given as images.
     """
 
     def __init__(self, agent: Agent, *modules: TensorDictModuleBase) -> None:
         super().__init__(*modules)
         self.__dict__["agent"] = agent  # not a submodule: the modules hold the parameters
+
+    @property
+    def takes_images(self) -> bool:
+        goal = self.agent.goal
+        return goal is not None and goal.image is not None
 
 
 class Agent(nn.Module):

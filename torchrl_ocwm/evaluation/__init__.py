@@ -3,7 +3,7 @@
 Needs the extra ``recipes``; ``plots`` and ``videos`` are imported from their modules.
 """
 
-from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, measure
+from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, goal_images, measure
 from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation
 from torchrl_ocwm.evaluation.reconstruction import ReconstructionError
 from torchrl_ocwm.evaluation.report import Report
@@ -14,6 +14,7 @@ __all__ = [
     "LandmarkEvaluation",
     "ReconstructionError",
     "Report",
+    "goal_images",
     "mean_and_error",
     "measure",
     "normalized_score",

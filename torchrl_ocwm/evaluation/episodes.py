@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import gymnasium
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -13,7 +14,7 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from tqdm import tqdm
 
-from torchrl_ocwm.envs import Task, make_env
+from torchrl_ocwm.envs import ENVIRONMENTS, Task, make_env
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.evaluation.scores import normalized_score
 
@@ -44,6 +45,7 @@ class EvaluationEnvs:
         policy: Policy,
         goals: Tensor,
         *,
+        images: Tensor | None = None,
         seed: int = 0,
         keep: tuple[Any, ...] = (),
         inspect: Callable[[TensorDictBase], dict[str, Tensor]] | None = None,
@@ -53,7 +55,9 @@ class EvaluationEnvs:
 
         Args:
             policy: The policy.
-            goals: ``[N, D]`` metres.
+            goals: ``[N, D]`` metres; the environments judge by them.
+            images: ``[N, 3, H, W]`` or ``[N, F, 3, H, W]`` uint8; given to the policy instead of the positions
+                (:class:`~torchrl_ocwm.modules.GivenGoals`).
             seed: Seeds the environments.
             keep: More keys to keep of each step.
             inspect: Called with each step's tensordict ``[E]`` after the policy; what it returns is kept too.
@@ -68,10 +72,11 @@ class EvaluationEnvs:
         self.env.set_seed(seed)
         batches = []
         with tqdm(total=len(goals), unit="goal", desc="evaluate", disable=not progress) as bar:
-            for chunk in goals.split(size):
+            for chunk in torch.arange(len(goals)).split(size):
                 # The last chunk is filled up with copies of its last goal.
-                full = torch.cat([chunk, chunk[-1:].expand(size - len(chunk), -1)])
-                batches.append(self._episodes(policy, full, keep, inspect)[: len(chunk)])
+                full = torch.cat([chunk, chunk[-1:].expand(size - len(chunk))])
+                seen = None if images is None else images[full]
+                batches.append(self._episodes(policy, goals[full], seen, keep, inspect)[: len(chunk)])
                 bar.update(len(chunk))
         return TensorDict.cat(batches)
 
@@ -80,12 +85,15 @@ class EvaluationEnvs:
         self,
         policy: Policy,
         goals: Tensor,
+        images: Tensor | None,
         keep: tuple[Any, ...],
         inspect: Callable[[TensorDictBase], dict[str, Tensor]] | None,
     ) -> TensorDict:
         options = [{"options": {"goal_position": goal.numpy()}} for goal in goals]
         per_worker = [{"list_of_kwargs": options[i : i + self.shape[1]]} for i in range(0, len(goals), self.shape[1])]
         tensordict = self.env.reset(list_of_kwargs=per_worker)
+        if images is not None:
+            tensordict["goal"] = TensorDict({"pixels": images.unflatten(0, self.shape)}, self.shape)
         steps = []
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             for _ in range(self.episode_steps):
@@ -108,6 +116,24 @@ class EvaluationEnvs:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+
+def goal_images(task: Task, goals: Tensor) -> Tensor:
+    """What would be seen with the object at each goal, its robot "teleported" there (paper, "Visual goals").
+
+    Args:
+        task: The task.
+        goals: ``[N, D]`` metres. Where the robot cannot reach one, the nearest reachable position is shown.
+
+    Returns:
+        ``[N, 3, H, W]`` uint8.
+    """
+    env = gymnasium.make(ENVIRONMENTS[task.name].id, **task.options)
+    env.reset(seed=0)
+    scene: Any = env.unwrapped
+    images = [torch.from_numpy(scene.goal_observation(goal)["pixels"]) for goal in goals.numpy()]
+    env.close()
+    return torch.stack(images)
 
 
 def measure(episodes: TensorDictBase, *, object_index: int = 0) -> dict[str, Tensor]:
