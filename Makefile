@@ -20,10 +20,11 @@ demo: check $(DEMO)/evaluation/.done
 	@echo
 	@echo "Where to look, all in $(DEMO):"
 	@echo "  evaluation/results.md, results.json   table and numbers, goal by goal"
-	@echo "  evaluation/heatmap.png                score over the workspace, beside random actions"
+	@echo "  evaluation/heatmap.png                score over the workspace: random actions, position goals, image goals"
 	@echo "  evaluation/learning_curve.png         scores and losses while it learnt"
 	@echo "  evaluation/episodes.mp4               above: what happened; below: what the agent imagined from frame one"
-	@echo "  dreamer_pcp/videos/                   open-loop predictions: truth, model, error"
+	@echo "  evaluation/episodes_image_goals.mp4   the same with goals given as images, which are shown on top"
+	@echo "  focus_lcp/videos/                     open-loop predictions: truth, model, error"
 
 test: check
 	$(BIN)/ruff check .
@@ -46,11 +47,11 @@ $(DEMO)/dataset/.done:
 	$(BIN)/python examples/collect.py env=reacher steps=$(STEPS) workers=$(WORKERS) dataset=$(@D)
 	@touch $@
 
-$(DEMO)/dreamer_pcp/.done: $(DEMO)/dataset/.done
-	$(BIN)/python examples/train_offline.py agent=dreamer_pcp env=reacher size=cpu \
+$(DEMO)/focus_lcp/.done: $(DEMO)/dataset/.done
+	$(BIN)/python examples/train_offline.py agent=focus_lcp env=reacher size=cpu \
 		dataset=$(<D) output=$(@D) training.updates=$(UPDATES) training.eval_interval=250 training.video_interval=500
 	@touch $@
 
-$(DEMO)/evaluation/.done: $(DEMO)/dreamer_pcp/.done
-	$(BIN)/python examples/evaluate.py checkpoint=$(<D)/checkpoint.zip goals=100 output=$(@D)
+$(DEMO)/evaluation/.done: $(DEMO)/focus_lcp/.done
+	$(BIN)/python examples/evaluate.py checkpoint=$(<D)/checkpoint.zip goals=100 image_goals=true output=$(@D)
 	@touch $@
