@@ -20,7 +20,9 @@ from torchrl_ocwm.evaluation import EvaluationEnvs, ReconstructionError, Report,
 from torchrl_ocwm.evaluation.plots import heatmap, learning_curves
 from torchrl_ocwm.evaluation.videos import imagined_rollout, mark, tile, write_video
 from torchrl_ocwm.training.config import recipe
+from torchrl_ocwm.training.offline import CHECKPOINT
 
+IMAGE_GOALS = ", image goals"
 CURVES = {
     "evaluation/final_score": "final score, landmark goals",
     "loss_model_object_position": "object position loss",
@@ -40,6 +42,8 @@ def main(config: DictConfig) -> None:
     images = goal_images(task, goals) if config.image_goals else None
     output = Path(config.output)
     report = Report(goals, {key: config[key] for key in ("goals", "episode_steps", "seed")})
+    for file in config.include:
+        report.include(Report.load(file))
     torch.manual_seed(config.seed)
     envs = EvaluationEnvs(
         task, episode_steps=config.episode_steps, workers=config.workers, envs=min(config.envs, config.goals)
@@ -52,7 +56,7 @@ def main(config: DictConfig) -> None:
             report.add(name, _evaluate(policy, envs, goals, config.seed), source=str(file))
             if images is not None and policy.takes_images:
                 seen = _evaluate(policy, envs, goals, config.seed, images)
-                report.add(f"{name}, image goals", seen, source=str(file))
+                report.add(name + IMAGE_GOALS, seen, source=str(file))
         report.save(output)
         heatmap(output / "heatmap.png", report.per_goal("final_score"), task.workspace, title="final score")
         if config.video_goals:
@@ -60,9 +64,7 @@ def main(config: DictConfig) -> None:
             _film(policies[-1], envs, goals[chosen], output / "episodes.mp4")
             if images is not None and policies[-1].takes_images:
                 _film(policies[-1], envs, goals[chosen], output / "episodes_image_goals.mp4", images[chosen])
-    runs: dict[str, list[Path]] = {}
-    for policy, file in zip(policies, files, strict=True):
-        runs.setdefault(agent_name(policy.agent.config), []).append(file.parent)
+    runs = {name: _folders(sources) for name, sources in report.sources.items() if not name.endswith(IMAGE_GOALS)}
     learning_curves(output / "learning_curve.png", runs, CURVES)
     print(report.markdown())
     print(f"\ntable, numbers, heatmap, learning curve, videos: {output}")
@@ -74,6 +76,11 @@ def _one_task(policies: list[Policy], files: list[Path]) -> Task:
         if task != tasks[0]:
             raise ValueError(f"{file} is of {task}, {files[0]} of {tasks[0]}; evaluate them one after the other")
     return tasks[0]
+
+
+def _folders(sources: list[str]) -> list[Path]:
+    """Where the runs of a row logged; random actions have no run."""
+    return [Path(source).parent for source in sources if source.endswith(CHECKPOINT)]
 
 
 def _evaluate(

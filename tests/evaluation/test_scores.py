@@ -71,5 +71,24 @@ class TestReport:
         assert (tmp_path / "new" / "results.md").read_text() == report.markdown() + "\n"
         assert not list((tmp_path / "new").glob(".*"))
 
+    def test_rows_of_an_earlier_report(self, report: Report, tmp_path: Path) -> None:
+        report.save(tmp_path)
+        again = Report.load(tmp_path / "results.json")
+        assert again.to_dict() == report.to_dict()
+        more = Report(report.goals, report.settings)
+        more.add("new", {"final_score": torch.zeros(len(report.goals))}, source="x")
+        more.include(again)
+        assert more.markdown().splitlines()[3:] == report.markdown().splitlines()[2:]
+        with pytest.raises(ValueError, match="other goals"):
+            Report(report.goals + 0.1, report.settings).include(again)
+        with pytest.raises(ValueError, match="other settings"):
+            Report(report.goals, {"seed": 7}).include(again)
+
+    def test_not_a_report(self, tmp_path: Path) -> None:
+        (tmp_path / "results.json").write_text('{"goals": [[0.0, 0.0]]}')
+        for file in (tmp_path / "results.json", tmp_path / "nothing.json"):
+            with pytest.raises(ValueError, match=r"json: not the results\.json of an evaluation"):
+                Report.load(file)
+
     def test_heatmap_is_the_mean_over_seeds(self, report: Report) -> None:
         torch.testing.assert_close(report.per_goal("final_score")["dreamer"], torch.tensor([0.7, 0.8]))

@@ -81,6 +81,11 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     assert len(results["agents"]["dreamer"]["per_goal"][0]["final_score"]) == 4
     for name in ("heatmap.png", "learning_curve.png", "episodes.mp4", "episodes_image_goals.mp4"):
         assert (output / name).stat().st_size > 1000, name
+    again = ("goals=4", "episode_steps=3", "workers=0", "envs=4", "video_goals=0", "random=false")
+    printed = run(
+        "evaluate.py", f"checkpoint={files[0]}", f"include=[{output}/results.json]", *again, f"output={tmp_path}/more"
+    )
+    assert [line.split(" | ")[1] for line in printed.splitlines()[2:7]] == ["1", "2", "2", "1", "1"]
     assert torchrl_ocwm.load_agent(files[0]).agent.config.goal == "position"
 
 

@@ -47,6 +47,37 @@ class Report:
     seeds: dict[str, list[dict[str, Tensor]]] = field(default_factory=dict)
     sources: dict[str, list[str]] = field(default_factory=dict)
 
+    @classmethod
+    def load(cls, file: str | Path) -> Report:
+        """Read a ``results.json`` that :meth:`save` wrote.
+
+        Raises:
+            ValueError: if it is something else.
+        """
+        try:
+            values = json.loads(Path(file).read_text())
+            report = cls(torch.tensor(values["goals"]), values["settings"])
+            for agent, row in values["agents"].items():
+                for source, seed in zip(row["sources"], row["per_goal"], strict=True):
+                    report.add(agent, {name: torch.tensor(one) for name, one in seed.items()}, source=source)
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{file}: not the results.json of an evaluation ({error!r})") from error
+        return report
+
+    def include(self, other: Report) -> None:
+        """Add the rows of another report.
+
+        Raises:
+            ValueError: if it was made with other goals or settings.
+        """
+        if self.goals.shape != other.goals.shape or not torch.allclose(self.goals, other.goals):
+            raise ValueError("these results were made with other goals")
+        if self.settings != other.settings:
+            raise ValueError(f"these results were made with other settings: {other.settings}, here {self.settings}")
+        for agent, seeds in other.seeds.items():
+            self.seeds.setdefault(agent, []).extend(seeds)
+            self.sources.setdefault(agent, []).extend(other.sources[agent])
+
     def add(self, agent: str, metrics: dict[str, Tensor], *, source: str) -> None:
         """Add one seed of an agent: metric → ``[N]`` values, one per goal."""
         self.seeds.setdefault(agent, []).append(metrics)
