@@ -74,6 +74,7 @@ def object_loss(model: WorldModel, config: AgentConfig, size: Size) -> FOCUSMode
     """What trains a world model with object latents."""
     return FOCUSModelLoss(
         model.records(),
+        lambda_positional=config.lambda_positional,
         positional_distance=config.latent_distance,
         positional_gradient=config.positional_gradient,
         **_weights(config, size),

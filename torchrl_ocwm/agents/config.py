@@ -48,6 +48,7 @@ class AgentConfig:
         lambda_proprio: Weight of the reconstruction of proprioception.
         lambda_object_position: Weight of the reconstruction of the object positions.
         lambda_goal_position: Weight of the reconstruction of the goal position.
+        lambda_positional: Weight of the loss of the latent positional encoder.
     """
 
     world_model: Literal["flat", "object"] = "flat"
@@ -60,6 +61,7 @@ class AgentConfig:
     lambda_proprio: float = 1.0
     lambda_object_position: float = 200.0
     lambda_goal_position: float = 1.0
+    lambda_positional: float = 1.0
 
     def __post_init__(self) -> None:
         check_choices(self)
