@@ -43,6 +43,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -110,7 +111,8 @@ def timed(function: Callable[[], object], device: str) -> float:
 
 def within(budget: float, rounds: int, measure: Callable[[], T]) -> list[T]:
     """One measurement per round, until the seconds are used up; the first three in any case."""
-    start, values = time.perf_counter(), []
+    start = time.perf_counter()
+    values: list[T] = []
     while len(values) < rounds and (len(values) < LEAST_ROUNDS or time.perf_counter() - start < budget):
         values.append(measure())
     return values
@@ -122,7 +124,7 @@ def make_reference(device: str) -> Callable[[], tuple[float, float]]:
     left, right = (torch.rand(1024, 1024, generator=generator).to(device) for _ in range(2))
     images = torch.rand(16, 3, 64, 64, generator=generator).to(device)
     widths = (3, 32, 64, 128, 256)
-    layers = [(nn.Conv2d(a, b, 4, 2), nn.ReLU()) for a, b in zip(widths[:-1], widths[1:], strict=True)]
+    layers = [(nn.Conv2d(a, b, 4, 2), nn.ReLU()) for a, b in pairwise(widths)]
     network = nn.Sequential(*(layer for pair in layers for layer in pair)).to(device)
 
     def convolutions() -> None:
@@ -241,7 +243,8 @@ def make_update(name: str, size: str, training: Training) -> tuple[Agent, Dreame
 def measure_whole(batch: TensorDictBase, arguments: argparse.Namespace) -> dict[str, Any]:
     """Seconds per update and of the reference, one each per round, and the peak memory of it all."""
     device = arguments.device
-    _, stepper = make_update(*arguments.child, Training(device=device, compile=arguments.compile))
+    agent, size = arguments.child
+    _, stepper = make_update(agent, size, Training(device=device, compile=arguments.compile))
     reference = make_reference(device)
     if any(stepper.resolve(torch.device(device))):
         stepper.warmup(batch)
@@ -258,8 +261,9 @@ def measure_whole(batch: TensorDictBase, arguments: argparse.Namespace) -> dict[
 def measure_parts(batch: TensorDictBase, arguments: argparse.Namespace) -> dict[str, float]:
     """Seconds of each part of an update."""
     device = arguments.device
+    agent, size = arguments.child
     training = Training(device=device, compile=False, cudagraph=False)
-    update = CutUpdate(*make_update(*arguments.child, training), device)
+    update = CutUpdate(*make_update(agent, size, training), device)
     update(batch)
     rounds = within(arguments.budget, arguments.rounds, lambda: update(batch))
     return {part: statistics.median(seconds[part] for seconds in rounds) for part in PARTS}
@@ -311,7 +315,7 @@ def print_table(size: str, agents: Sequence[str], updates: int) -> None:
     """Measure the agents at a size, with a row as soon as there is one."""
     sizes, results = ALL_SIZES[size], []
     print(f"\nSize {size}: {sizes.batch_size} sequences of {sizes.slice_len} frames, CNN depth {sizes.cnn_depth}\n")
-    peer = ["peer s", "peer / ours", "peer MiB", "peer / ours"]
+    peer = ["peer s", "peer s / ours", "peer MiB", "peer MiB / ours"]
     head = ["agent", "s/update", "x reference", "peak MiB", *peer, *PARTS]
     print(line(head), line(["---", *["---:"] * (len(head) - 1)]), sep="\n", flush=True)
     for agent in agents:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -8,8 +9,10 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torchrl_ocwm.agents import SIZES, build_agent
 from torchrl_ocwm.objectives import FOCUSModelLoss, mask_nll, object_reconstruction, positional_latent_loss
 from torchrl_ocwm.objectives.focus import visible_position_reconstruction
+from torchrl_ocwm.testing import reacher_task
 
 
 @pytest.fixture
@@ -208,6 +211,15 @@ def test_weights_and_keys(make_agent: Any, records: TensorDict) -> None:
     got = losses(nested, batch)
     for name, value in plain.items():
         torch.testing.assert_close(got[name], value)
+
+
+@pytest.mark.parametrize("name", ["focus", "focus_pcp", "focus_lcp"])
+def test_update_with_the_layers_of_the_paper(records: TensorDict, name: str) -> None:
+    size = replace(SIZES["debug"], style="dreamer_v2")
+    agent = build_agent(name, reacher_task(), size)
+    losses = agent.loss(records)
+    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    assert {part for part, child in agent.model.named_children() if not moved(child)} <= {"two_hot", "units"}
 
 
 @pytest.mark.slow

@@ -78,8 +78,10 @@ class LatentOfImages(nn.Module):
 
     def forward(self, embeddings: Tensor) -> tuple[Tensor, Tensor]:
         shape = embeddings.shape[:-2]
-        latent = TensorDict({name: embeddings.new_zeros(*shape, size) for name, size in self.sizes.items()}, shape)
-        latent["is_init"] = torch.zeros(*shape, 1, dtype=torch.bool, device=embeddings.device)
+        embeddings = embeddings.reshape(-1, *embeddings.shape[-2:])  # a GRU takes one batch dimension
+        count = embeddings.shape[:1]
+        latent = TensorDict({name: embeddings.new_zeros(*count, size) for name, size in self.sizes.items()}, count)
+        latent["is_init"] = torch.zeros(*count, 1, dtype=torch.bool, device=embeddings.device)
         for embedding in embeddings.unbind(-2):
             latent = self.estimator(latent.set("encoded_latents", embedding))
-        return latent["state"], latent["belief"]
+        return latent["state"].reshape(*shape, -1), latent["belief"].reshape(*shape, -1)
