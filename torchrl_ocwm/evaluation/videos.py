@@ -13,7 +13,9 @@ from torch import Tensor
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.data.dataset import EpisodeDataset
-from torchrl_ocwm.modules import WorldModel
+from torchrl_ocwm.evaluation.objects import decode_objects
+from torchrl_ocwm.evaluation.open_loop import open_loop_latents
+from torchrl_ocwm.modules import ObjectWorldModel, WorldModel
 
 
 def write_video(path: str | Path, frames: Tensor, *, fps: int = 15, scale: int = 3) -> None:
@@ -62,14 +64,11 @@ def open_loop_prediction(model: WorldModel, records: TensorDictBase, context: in
     Returns:
         ``[N, T, 3, H, W]`` uint8: reconstructions of the context, then predictions.
     """
-    seen = model.records()(records[:, :context].clone())["next"]
-    step = TensorDict({"latent": seen[:, -1].select("state", "belief")}, [len(records)])
-    transition = model.transition()
-    images = list(decode_pixels(model, seen).unbind(1))
-    for t in range(context, records.shape[1]):
-        step = transition(step.select("latent").set("action", records["action"][:, t]))
-        images.append(decode_pixels(model, step["latent"]))
-    return to_uint8(torch.stack(images, 1))
+    return _images(model, open_loop_latents(model, records, context))
+
+
+def _images(model: WorldModel, latents: TensorDictBase) -> Tensor:
+    return torch.stack([to_uint8(decode_pixels(model, step)) for step in latents.unbind(1)], 1)
 
 
 def decode_pixels(model: WorldModel, latent: TensorDictBase) -> Tensor:
@@ -82,8 +81,20 @@ def to_uint8(images: Tensor) -> Tensor:
     return (images.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
+def grey(masks: Tensor) -> Tensor:
+    """Masks ``[..., H, W]`` in [0, 1] as images ``[..., 3, H, W]`` uint8: white where an object is.
+
+    Examples:
+        >>> grey(torch.tensor([[0.0, 1.0]]))[0]
+        tensor([[  0, 255]], dtype=torch.uint8)
+    """
+    return to_uint8(masks.float()).unsqueeze(-3).expand(*masks.shape[:-2], 3, -1, -1)
+
+
 class OpenLoopFilm:
     """Open-loop predictions on a few fixed sequences of a dataset: truth, model and error, one below the other.
+
+    Below the images of an object-centric model are the masks that it predicts, one row per object.
 
     Args:
         agent: The agent in training.
@@ -113,13 +124,17 @@ class OpenLoopFilm:
         starts = lengths.cumsum(0)[episodes] - lengths[episodes]
         self.records = dataset.records[starts[:, None] + torch.arange(length)].contiguous()
 
+    @torch.no_grad()
     def __call__(self, updates: int) -> Path:
-        device = next(self.agent.parameters()).device
-        predicted = open_loop_prediction(self.agent.model, self.records.to(device), self.context).cpu()
-        truth = self.records["next", "pixels"]
+        model, device = self.agent.model, next(self.agent.parameters()).device
+        latents = open_loop_latents(model, self.records.to(device), self.context)
+        truth, predicted = self.records["next", "pixels"], _images(model, latents).cpu()
+        masks: tuple[Tensor, ...] = ()
+        if isinstance(model, ObjectWorldModel):
+            masks = grey(decode_objects(model, latents)[1][:, :, :-1]).cpu().unbind(2)
         error = (predicted.int() - truth.int()).abs().to(torch.uint8)
         file = self.folder / f"open_loop_{updates:07d}.mp4"
-        write_video(file, tile([truth, predicted, error]))
+        write_video(file, tile([truth, predicted, *masks, error]))
         return file
 
 

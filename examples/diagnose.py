@@ -1,0 +1,136 @@
+"""Look into a world model: ``python examples/diagnose.py checkpoint=.../checkpoint.zip dataset=data/reacher``.
+
+How well it sees and imagines masks and positions of the objects, and whether goal latents match what they stand for.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_ocwm import load_agent
+from torchrl_ocwm.agents import Agent
+from torchrl_ocwm.data import EpisodeDataset
+from torchrl_ocwm.envs import Task
+from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
+from torchrl_ocwm.evaluation.object_pictures import (
+    draw_errors,
+    draw_goal_latents,
+    draw_objects,
+    film_objects,
+    object_rows,
+)
+from torchrl_ocwm.evaluation.objects import object_errors
+from torchrl_ocwm.evaluation.open_loop import random_sequences
+from torchrl_ocwm.modules import ObjectWorldModel
+from torchrl_ocwm.training.config import recipe
+
+GOALS = {
+    "cosine": ("cosine", 3),
+    "cosine_with_others": ("cosine with others", 3),
+    "median_rank": ("median rank", 1),
+    "mean_rank": ("mean rank", 2),
+    "ranked_first": ("ranked first", 2),
+    "distance": ("distance of the best match, m", 4),
+    "distance_to_others": ("distance of others, m", 4),
+}
+
+
+@recipe(Path(__file__).parent / "config", "diagnose")
+def main(config: DictConfig) -> None:
+    agent = load_agent(config.checkpoint, device=config.device).agent
+    records = _records(config, agent.task)
+    output = Path(config.output)
+    output.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(config.seed)
+    errors, goals = _errors(agent, records, config, output), _goals(agent, records, config, output)
+    table = "\n\n".join(part for part in (_error_table(errors, agent.task.objects), _goal_table(goals)) if part)
+    numbers = {"settings": {**config}, "objects": agent.task.objects, "errors": errors, "goal_latents": goals}
+    (output / "diagnosis.json").write_text(json.dumps(_plain(numbers), indent=1) + "\n")
+    (output / "diagnosis.md").write_text(table + "\n")
+    print(table)
+    print(f"\ntable, numbers, pictures: {output}")
+
+
+def _records(config: DictConfig, task: Task) -> TensorDictBase:
+    dataset = EpisodeDataset.open(config.dataset)
+    there = Task.from_dict(dataset.metadata["task"])
+    if there != task:
+        raise ValueError(f"{dataset.path}: holds {there}, but the agent in {config.checkpoint} is of {task}")
+    if not 0 < config.context < config.length:
+        raise ValueError(
+            f"context={config.context} of length={config.length} frames: some have to be seen and some to be imagined"
+        )
+    records = random_sequences(dataset, config.sequences, config.length, seed=config.seed)
+    return records.to(config.device)
+
+
+def _errors(agent: Agent, records: TensorDictBase, config: DictConfig, output: Path) -> dict[str, dict[str, Tensor]]:
+    """Masks and positions; the pictures of each object, if the world model has any."""
+    model, names = agent.model, agent.task.objects
+    errors = object_errors(model, records, config.context)
+    if errors["imagined"]:
+        draw_errors(output / "errors.png", errors, names)
+    if isinstance(model, ObjectWorldModel) and config.video_sequences:
+        rows = object_rows(model, records[: config.video_sequences], config.context, names)
+        film_objects(output / "objects.mp4", rows)
+        draw_objects(output / "objects.png", rows, config.context)
+    return errors
+
+
+def _goals(agent: Agent, records: TensorDictBase, config: DictConfig, output: Path) -> dict[str, dict[str, float]]:
+    """Goal latents of the object that is to be positioned, if the agent has such."""
+    model = agent.model
+    if not isinstance(model, ObjectWorldModel) or model.positional_encoder is None:
+        return {}
+    pairs, positions = latent_pairs(model, records, frames=config.frames, seed=config.seed)
+    draw_goal_latents(output / "goal_latents.png", pairs, positions)
+    return {name: match(*pair, positions) for name, pair in pairs.items()}
+
+
+def _error_table(errors: dict[str, dict[str, Tensor]], names: tuple[str, ...]) -> str:
+    """Rows: object, view and a few steps; columns: overlap of masks, median and quartiles of the position error."""
+    if not errors["imagined"]:
+        return ""
+    steps = next(iter(errors["imagined"].values())).shape[-1]
+    shown = sorted({1, math.ceil(steps / 3), steps})
+    lines = ["| object | view | step | mask IoU | position error, m | quartiles |", "|---|---|---|---|---|---|"]
+    for index, name in enumerate(names):
+        for view, curves in errors.items():
+            for step in shown:
+                at = {key: float(values[index, step - 1]) for key, values in curves.items()}
+                overlap = f"{at['mask_overlap']:.2f}" if "mask_overlap" in at else "–"
+                error = f"{at['median']:.4f} | {at['lower']:.4f} to {at['upper']:.4f}" if "median" in at else "– | –"
+                lines.append(f"| {name} | {view} | {step} | {overlap} | {error} |")
+    return "\n".join(lines)
+
+
+def _goal_table(goals: dict[str, dict[str, float]]) -> str:
+    if not goals:
+        return ""
+    titles = [title for title, _ in GOALS.values()]
+    lines = ["| goal, compared with | " + " | ".join(titles) + " |", "|---|" + "---|" * len(titles)]
+    for name, values in goals.items():
+        cells = [f"{values[key]:.{digits}f}" for key, (_, digits) in GOALS.items()]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _plain(values: Any) -> Any:
+    """Tensors as lists; JSON has no NaN, so that it becomes ``None``."""
+    if isinstance(values, dict):
+        return {name: _plain(value) for name, value in values.items()}
+    if isinstance(values, (list, tuple, Tensor)):
+        return [_plain(value) for value in (values.tolist() if isinstance(values, Tensor) else values)]
+    return None if isinstance(values, float) and math.isnan(values) else values
+
+
+if __name__ == "__main__":
+    main()
