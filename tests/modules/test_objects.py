@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -87,6 +88,21 @@ class TestLatentSimilarityReward:
     def test_mse_by_hand(self) -> None:
         reward = LatentSimilarityReward(distance="mse")(self.data.clone())["reward"]
         torch.testing.assert_close(reward, torch.tensor([[-5.0]]))
+
+    @pytest.mark.parametrize(("index", "expected"), [(0, -math.sqrt(0.4)), (1, -2.0)])
+    def test_chord_by_hand(self, index: int, expected: float) -> None:
+        reward = LatentSimilarityReward(object_index=index, distance="chord")(self.data.clone())["reward"]
+        torch.testing.assert_close(reward, torch.tensor([[expected]]))
+
+    def test_chord_keeps_its_slope_where_the_cosine_is_flat(self) -> None:
+        slopes = {}
+        for distance in ("cosine", "chord"):
+            latent = torch.tensor([[[1.0, 0.01]]], requires_grad=True)
+            data = TensorDict({"object_latent": latent, "latent": {"goal": torch.tensor([[2.0, 0.0]])}}, [1])
+            LatentSimilarityReward(distance=distance)(data)["reward"].sum().backward()
+            slopes[distance] = -float(latent.grad[0, 0, 1])
+        assert slopes["cosine"] == pytest.approx(0.01, rel=1e-3)
+        assert slopes["chord"] == pytest.approx(1.0, rel=1e-3)
 
 
 def test_positions_come_from_the_objects_own_latent(make_agent: Any) -> None:

@@ -171,6 +171,11 @@ def latent_similarity_reward(model: WorldModel, config: AgentConfig) -> TensorDi
     return TensorDictSequential(_object_centric(model).object_latent(), reward)
 
 
+def latent_chord_reward(model: WorldModel, _: AgentConfig) -> TensorDictModuleBase:
+    """Minus the distance between the directions of the object's latent and the goal latent."""
+    return TensorDictSequential(_object_centric(model).object_latent(), LatentSimilarityReward(distance="chord"))
+
+
 def _object_centric(model: WorldModel) -> ObjectWorldModel:
     if not isinstance(model, ObjectWorldModel):
         raise ValueError("goals and rewards on object latents need world_model='object'")
@@ -191,6 +196,7 @@ REWARDS: dict[str, Callable[[WorldModel, AgentConfig], TensorDictModuleBase]] = 
     "head": learned_reward,
     "position_distance": position_distance_reward,
     "latent_similarity": latent_similarity_reward,
+    "latent_chord": latent_chord_reward,
 }
 GOAL_SOURCES: dict[str, Callable[[WorldModel, Any], TensorDictModuleBase | None]] = {
     "environment": no_source,

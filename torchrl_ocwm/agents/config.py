@@ -36,12 +36,12 @@ class AgentConfig:
         world_model: Which world model: one latent for the whole scene, or one for each object too.
         goal: How a goal position becomes what policy and critic see beside the latent: not at all, as it is,
             or as the latent that the object would have there.
-        reward: The reward in imagination: the learned head, the distance of the decoded position to the goal, or the
-            similarity of the object's latent and the goal latent.
+        reward: The reward in imagination: the learned head, the distance of the decoded position to the goal, the
+            similarity of the object's latent and the goal latent, or the distance between the directions of these.
         goal_source: Where goals in imagination come from: ``"environment"`` (in the observations), ``"uniform"`` in the
             workspace for each imagined start, ``"frames"`` of the dataset, or ``"mixed"``, half of each.
-        latent_distance: How far apart two object latents are, in the reward and in training the encoder of goals: minus
-            the cosine similarity, or the mean squared error.
+        latent_distance: How far apart two object latents are, in the reward ``"latent_similarity"`` and in training
+            what encodes goals: minus the cosine similarity, or the mean squared error.
         positional_gradient: What the loss of the latent positional encoder trains: the encoder, the object latents that
             it aims at, or both.
         observed: Vectors that the world model sees and reconstructs, beside the image.
@@ -53,7 +53,7 @@ class AgentConfig:
 
     world_model: Literal["flat", "object"] = "flat"
     goal: Literal["none", "position", "object_latent"] = "none"
-    reward: Literal["head", "position_distance", "latent_similarity"] = "head"
+    reward: Literal["head", "position_distance", "latent_similarity", "latent_chord"] = "head"
     goal_source: Literal["environment", "uniform", "frames", "mixed"] = "environment"
     latent_distance: Literal["cosine", "mse"] = "cosine"
     positional_gradient: Literal["encoder", "latent", "both"] = "both"

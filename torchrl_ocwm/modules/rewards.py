@@ -7,7 +7,7 @@ from typing import Literal
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torch.nn.functional import cosine_similarity
+from torch.nn.functional import cosine_similarity, normalize
 
 from torchrl_ocwm.modules.units import WorkspaceUnits
 
@@ -50,17 +50,21 @@ class PositionDistance(nn.Module):
         return position_distance(self.units.to_metres(position), self.units.to_metres(goal))  # Eq. 3
 
 
+LatentReward = Literal["cosine", "mse", "chord"]
+
+
 class LatentSimilarity(nn.Module):
-    """Cosine similarity of an object's latent and a goal latent (paper, r_LCP), or minus their mean squared error.
+    """Cosine similarity of an object's latent and a goal latent (paper, r_LCP), or minus a distance between them.
 
     Args:
         object_index: Which object is to be positioned.
-        distance: ``"cosine"`` or ``"mse"``.
+        distance: ``"cosine"``; ``"mse"``, the mean squared error; ``"chord"``, the distance between the two directions,
+            √(2 − 2 cos), which keeps its slope up to the goal as a distance of positions does.
 
     Called with object latents ``[..., O + 1, L]`` and goals ``[..., L]``; returns ``[..., 1]``.
     """
 
-    def __init__(self, object_index: int = 0, distance: Literal["cosine", "mse"] = "cosine") -> None:
+    def __init__(self, object_index: int = 0, distance: LatentReward = "cosine") -> None:
         super().__init__()
         self.object_index, self.distance = object_index, distance
 
@@ -68,6 +72,8 @@ class LatentSimilarity(nn.Module):
         latent = object_latent[..., self.object_index, :]
         if self.distance == "cosine":
             return cosine_similarity(latent, goal, dim=-1).unsqueeze(-1)
+        if self.distance == "chord":
+            return position_distance(normalize(latent, dim=-1), normalize(goal, dim=-1))
         return -(latent - goal).square().mean(-1, keepdim=True)
 
 
@@ -78,7 +84,8 @@ class LatentSimilarityReward(TensorDictModule):
 
     Args:
         object_index: Which object is to be positioned; any of the scene.
-        distance: Cosine similarity, or minus the mean squared error (``"mse"``).
+        distance: Cosine similarity, or minus the mean squared error (``"mse"``) or the distance of the directions
+            (``"chord"``).
         object_latent_key: Extracted latents, ``[..., O + 1, L]``.
         goal_key: Goal latent, ``[..., L]``.
         reward_key: Key written, ``[..., 1]``.
@@ -96,7 +103,7 @@ class LatentSimilarityReward(TensorDictModule):
         self,
         *,
         object_index: int = 0,
-        distance: Literal["cosine", "mse"] = "cosine",
+        distance: LatentReward = "cosine",
         object_latent_key: NestedKey = "object_latent",
         goal_key: NestedKey = ("latent", "goal"),
         reward_key: NestedKey = "reward",
