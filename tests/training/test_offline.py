@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import signal
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointError
 
 import torchrl_ocwm
 from torchrl_ocwm.agents import SIZES, Agent, build_agent
+from torchrl_ocwm.agents.checkpoint import describe, rebuild
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.testing import random_dataset, reacher_task
 from torchrl_ocwm.training.offline import train_offline
@@ -132,6 +134,29 @@ class TestLoadAgent:
         Checkpoint(format="archive", loss_module=torch.nn.Linear(1, 1)).save(tmp_path / "x.zip")
         with pytest.raises(CheckpointError, match="not of an agent of torchrl_ocwm"):
             torchrl_ocwm.load_agent(tmp_path / "x.zip")
+
+
+class TestOtherReleases:
+    """Descriptions in checkpoints, with settings that this release does not have or that are not there yet."""
+
+    def description(self) -> dict[str, Any]:
+        return json.loads(json.dumps(describe(fresh("focus_lcp"))))
+
+    def test_settings_that_came_later_take_their_defaults(self) -> None:
+        description = self.description()
+        del description["agent"]["lambda_positional"], description["size"]["gamma"]
+        agent = rebuild(description)
+        assert (agent.config.lambda_positional, agent.size.gamma) == (1.0, 0.99)
+
+    def test_settings_that_are_gone(self) -> None:
+        description = self.description()
+        description["agent"]["colour"] = "red"
+        del description["size"]["belief"]
+        with pytest.raises(CheckpointError, match=r"another release: AgentConfig differs in \['colour'\]"):
+            rebuild(description)
+        del description["agent"]["colour"]
+        with pytest.raises(CheckpointError, match=r"another release: Size differs in \['belief'\]"):
+            rebuild(description)
 
 
 class TestBadInput:

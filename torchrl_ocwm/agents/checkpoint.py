@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields
+from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -92,8 +92,10 @@ def _plain(value: Any) -> Any:
 
 
 def _dataclass(kind: type[T], values: dict[str, Any]) -> T:
-    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
-    if set(values) != names:
-        odd = sorted(set(values) ^ names)
+    known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+    # A setting that a later release adds has the default that was the rule before.
+    needed = {name for name, field in known.items() if field.default is MISSING}
+    odd = sorted((set(values) - set(known)) | (needed - set(values)))
+    if odd:
         raise CheckpointError(f"the checkpoint is of another release: {kind.__name__} differs in {odd}")
     return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
