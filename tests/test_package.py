@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 import torchrl_ocwm
+from torchrl_ocwm import check
+from torchrl_ocwm.envs import ENVIRONMENTS
 
 
 def requirements(name: str, seen: set[str]) -> set[str]:
@@ -89,7 +91,14 @@ def test_check_says_what_to_install() -> None:
 
 def test_check_finds_the_renderer() -> None:
     done = subprocess.run([sys.executable, "-m", "torchrl_ocwm.check"], capture_output=True, text=True, check=False)
-    assert done.stdout == "reacher: simulates and renders\n", done.stderr
+    assert done.stdout.splitlines() == [f"{name}: simulates and renders" for name in ENVIRONMENTS], done.stderr
+
+
+def test_check_goes_on_without_a_simulator(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    missing = ENVIRONMENTS["cube_move"]._replace(module="no_such_simulator")
+    monkeypatch.setitem(ENVIRONMENTS, "cube_move", missing)
+    assert check.main() == 0
+    assert "cube_move: not installed, pip install 'torchrl-ocwm[robosuite]'" in capsys.readouterr().out
 
 
 def test_unknown_attribute() -> None:

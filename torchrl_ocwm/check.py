@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib.util import find_spec
 
 
 def main() -> int:
@@ -10,7 +11,10 @@ def main() -> int:
     try:
         from torchrl_ocwm.envs import ENVIRONMENTS, make_env
 
-        for name in ENVIRONMENTS:
+        for name, environment in ENVIRONMENTS.items():
+            if find_spec(environment.module) is None:
+                sys.stdout.write(f"{name}: not installed, pip install 'torchrl-ocwm[{environment.extra}]'\n")
+                continue
             make_env(name).close()
             sys.stdout.write(f"{name}: simulates and renders\n")
     except (ModuleNotFoundError, RuntimeError) as error:

@@ -18,12 +18,14 @@ from torchrl_ocwm.envs.workspace import Workspace
 
 if TYPE_CHECKING:
     from torchrl_ocwm.envs.camera import Camera, Frame
+    from torchrl_ocwm.envs.cube_move import CubeMove
     from torchrl_ocwm.envs.positioning import PositioningEnv
     from torchrl_ocwm.envs.reacher import Reacher
 
 __all__ = [
     "ENVIRONMENTS",
     "Camera",
+    "CubeMove",
     "Frame",
     "MaskToPosition",
     "PositioningEnv",
@@ -40,6 +42,7 @@ __all__ = [
 # These need a simulator, so they are imported when they are asked for.
 _LAZY = {
     "Camera": "camera",
+    "CubeMove": "cube_move",
     "Frame": "camera",
     "PositioningEnv": "positioning",
     "Reacher": "reacher",

@@ -58,9 +58,11 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     axes: ClassVar[tuple[int, ...]]
     camera_name: ClassVar[str]
     #: Geoms of each object, by name; the first object is the one to position.
-    objects: ClassVar[dict[str, tuple[str, ...]]]
+    objects: dict[str, tuple[str, ...]]
     #: Plane (n, d) that the objects move on; ``None``: read the depth.
     plane: ClassVar[tuple[float, float, float, float] | None] = None
+    #: How far the middle of an object lies behind its visible surface, metres along the optical axis.
+    depth_offset: ClassVar[float] = 0.0
 
     def __init__(
         self,
@@ -232,7 +234,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
             torch.from_numpy(masks),
             self._intrinsics,
             self._extrinsics,
-            depth=None if frame.depth is None else torch.from_numpy(frame.depth[None]),
+            depth=None if frame.depth is None else torch.from_numpy(frame.depth[None] + self.depth_offset),
             plane=self._plane,
         )
         seen = visible.numpy()

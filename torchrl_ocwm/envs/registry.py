@@ -25,6 +25,7 @@ class Environment(NamedTuple):
 #: Short name → environment.
 ENVIRONMENTS = {
     "reacher": Environment("ocwm/Reacher-v0", "torchrl_ocwm.envs.reacher:Reacher", "dm-control", "dm_control"),
+    "cube_move": Environment("ocwm/CubeMove-v0", "torchrl_ocwm.envs.cube_move:CubeMove", "robosuite", "robosuite"),
 }
 
 

@@ -1,0 +1,490 @@
+"""The Cube move environment: robosuite's physics, positions from depth, goals, a second cube, goal observations."""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.seeding import np_random
+from robosuite.controllers import load_composite_controller_config, load_part_controller_config
+from robosuite.environments.manipulation.lift import Lift
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_ocwm.envs import CubeMove, Task, make_env, make_task, registry
+
+GOAL = np.array([0.1, -0.12], np.float32)
+STILL = np.array([0.0, 0.0, 0.0, -1.0])
+# The camera: agentview, moved; it looks 45 degrees down, with a view of 45 degrees over 64 pixels.
+EYE, FOCAL = np.array([0.7, 0.0, 1.75]), 32 / np.tan(np.deg2rad(22.5))
+FORWARD, RIGHT, DOWN = np.array([[-1, 0, -1], [0, 2**0.5, 0], [1, 0, -1]]) / 2**0.5
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = CubeMove()
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def twin():
+    env = CubeMove()
+    env.reset(seed=99)
+    env.step(np.ones(4))  # it has a past
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def pair():
+    env = CubeMove(objects=("cube", "distractor"))
+    yield env
+    env.close()
+
+
+@pytest.fixture
+def hide(env):
+    """Make the cube invisible, and visible again after the test."""
+    geom = env.model.geom("cube_g0_vis").id
+    colour = env.model.geom_rgba[geom].copy()
+
+    def hide(hidden: bool = True):
+        env.model.geom_rgba[geom, 3] = 0 if hidden else colour[3]
+
+    yield hide
+    env.model.geom_rgba[geom] = colour
+
+
+def actions(number: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, (number, 4))
+
+
+def assert_same(first, second):
+    assert first.keys() == second.keys()
+    for key in first:
+        assert np.array_equal(first[key], second[key]), key
+
+
+def pixel(x: float, y: float, z: float) -> tuple[float, float]:
+    """Column and row at which a point in the world is seen, by hand."""
+    ray = np.array([x, y, z]) - EYE
+    return 32 + FOCAL * (ray @ RIGHT) / (ray @ FORWARD), 32 + FOCAL * (ray @ DOWN) / (ray @ FORWARD)
+
+
+def with_cube_at(env: CubeMove, x: float, y: float, z: float, turn: float = 0.0):
+    """What is seen with the cube put somewhere."""
+    address = env.model.joint("cube_joint0").qposadr[0]
+    env.data.qpos[address : address + 7] = x, y, z, np.cos(turn / 2), 0, 0, np.sin(turn / 2)
+    mujoco.mj_forward(env.model, env.data)
+    return env._observe(env.data)
+
+
+def error(observation, index: int = 0) -> float:
+    """Distance between estimated and true position, millimetres."""
+    return 1000 * float(np.linalg.norm((observation["object_position"] - observation["object_position_true"])[index]))
+
+
+def move_to(env: CubeMove, observation, target, steps: int):
+    """Move the closed gripper towards a place relative to the start."""
+    for _ in range(steps):
+        move = ((np.array(target) - observation["proprio"][-3:]) / 0.05).clip(-1, 1)
+        observation, *_ = env.step(np.append(move, 1.0))
+    return observation
+
+
+@pytest.mark.slow
+def test_gymnasium_checker():
+    env = gymnasium.make("ocwm/CubeMove-v0", render_mode="rgb_array", image_size=32)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped)
+    env.close()
+    # Positions have no bounds; that is all it may complain about.
+    assert [str(w.message) for w in caught if "infinity" not in str(w.message)] == []
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_torchrl_specs_and_horizon():
+    env = make_env("cube_move", horizon=3, image_size=32, seed=1)
+    check_env_specs(env)
+    rollout = env.rollout(6)
+    env.close()
+    assert rollout["next", "masks"].shape == (3, 1, 32, 32)
+    assert rollout["action"].shape == (3, 4)
+    assert rollout["next", "truncated"].flatten().tolist() == [False, False, True]
+    assert not rollout["next", "terminated"].any()
+    assert rollout["next", "proprio"].isfinite().all()
+
+
+# The data contract.
+
+
+def test_observation_has_the_keys_shapes_and_types_of_the_contract(env):
+    observation, _ = env.reset(seed=0)
+    assert {key: (value.shape, value.dtype) for key, value in observation.items()} == {
+        "pixels": ((3, 64, 64), np.uint8),
+        "masks": ((1, 64, 64), np.bool_),
+        "proprio": ((19,), np.float32),
+        "object_position": ((1, 2), np.float32),
+        "object_visible": ((1,), np.bool_),
+        "goal_position": ((2,), np.float32),
+        "object_position_true": ((1, 2), np.float32),
+    }
+    assert env.action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
+    assert env.observation_space.contains(observation)
+    assert env.observation_space.contains(env.step(np.ones(4))[0])
+
+
+def test_proprio_and_true_position_are_robosuites_own(env):
+    env.reset(seed=1)
+    observation, *_ = env.step(np.ones(4))
+    suite, data = env._suite, env.data
+    mujoco.mj_forward(env.model, data)
+    robot = suite.robots[0]
+    fingers = data.qpos[robot._ref_gripper_joint_pos_indexes["right"]]
+    gripper = data.site_xpos[robot.eef_site_id["right"]] - [0, 0, 0.82]
+    expected = np.concatenate([robot._joint_positions, robot._joint_velocities, fingers, gripper])
+    assert observation["proprio"] == pytest.approx(expected, abs=1e-6)
+    assert observation["object_position_true"][0] == pytest.approx(data.xpos[suite.cube_body_id][:2], abs=1e-6)
+
+
+def test_the_cube_is_red_and_where_the_camera_must_see_it(env):
+    env.reset(seed=2)
+    for x, y in [(0, 0), (0.25, 0.25), (-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25)]:
+        observation = with_cube_at(env, x, y, 0.82, turn=0.4)
+        mask = observation["masks"][0]
+        red, green, blue = observation["pixels"][:, mask].astype(int)
+        assert (red > 1.5 * green).all()
+        assert (red > 1.5 * blue).all()
+        rows, columns = np.nonzero(mask)
+        column, row = pixel(x, y, 0.82)
+        assert columns.mean() + 0.5 == pytest.approx(column, abs=0.6)
+        assert rows.mean() + 0.5 == pytest.approx(row, abs=0.6)
+
+
+def test_reward_is_minus_the_distance_and_success_within_five_centimetres(env):
+    start, _ = env.reset(seed=3)
+    position = start["object_position"][0]
+    for distance, success in [(0.04, True), (0.06, False)]:
+        _, info = env.reset(seed=3, options={"goal_position": position + np.array([distance, 0])})
+        assert info == {"success": success}
+        observation, reward, *_, info = env.step(STILL)
+        offset = observation["object_position"][0] - observation["goal_position"]
+        assert reward == pytest.approx(-np.hypot(*offset), abs=1e-6)
+        assert info == {"success": bool(np.hypot(*offset) <= 0.05)}
+
+
+def test_nothing_of_robosuites_own_marks_in_the_picture(env):
+    env.reset(seed=0)
+    assert (env.model.site_rgba[:, 3] <= 0).all()
+    seen = np.unique(env.camera.render(env.data).geoms)
+    assert (env.model.geom_group[seen[seen >= 0]] == 1).all()
+
+
+# Physics and time.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("repeat", [1, 2])
+def test_starts_and_physics_are_those_of_robosuite(repeat):
+    """Beside an environment of robosuite with its own loop and observations, and the same random numbers."""
+    controller = load_composite_controller_config(robot="Panda")
+    gripper = controller["body_parts"]["right"]["gripper"]
+    controller["body_parts"]["right"] = load_part_controller_config(default_controller="OSC_POSITION")
+    controller["body_parts"]["right"]["gripper"] = gripper
+    original = Lift(
+        robots="Panda",
+        controller_configs=controller,
+        use_camera_obs=False,
+        has_offscreen_renderer=False,
+        hard_reset=False,
+        control_freq=20,
+        seed=0,
+    )
+    env = CubeMove(action_repeat=repeat, image_size=8)
+    env.reset(seed=7)
+    original.rng, _ = np_random(7)
+    original.placement_initializer.rng = original.rng
+    original.rng.uniform(size=2)  # the goal
+    original.reset()
+    assert np.array_equal(env.data.qpos, original.sim.data.qpos)
+    for action in actions(8):
+        env.step(action)
+        for _ in range(repeat):
+            original.step(action)
+        assert np.array_equal(env.data.qpos, original.sim.data.qpos)
+        assert np.array_equal(env.data.qvel, original.sim.data.qvel)
+    env.close()
+
+
+def test_start_states(env):
+    env.reset(seed=0)
+    starts = np.stack([env.reset()[0]["object_position_true"][0] for _ in range(20)])
+    assert (np.abs(starts) <= 0.03).all()
+    assert (np.ptp(starts, axis=0) > 0.03).all()
+
+
+def test_actions_move_the_gripper(env):
+    for axis in range(3):
+        for sign in (-1, 1):
+            before, _ = env.reset(seed=4)
+            action = STILL.copy()
+            action[axis] = sign
+            for _ in range(3):
+                after, *_ = env.step(action)
+            moved = after["proprio"][-3:] - before["proprio"][-3:]
+            assert sign * moved[axis] > 0.05
+            assert np.abs(np.delete(moved, axis)).max() < 0.03
+
+
+def test_the_gripper_opens_and_closes(env):
+    env.reset(seed=4)
+    widths = []
+    for gripper in (-1, 1):
+        for _ in range(5):
+            observation, *_ = env.step(np.array([0, 0, 0, gripper]))
+        widths.append(observation["proprio"][14] - observation["proprio"][15])
+    assert widths[0] == pytest.approx(0.08, abs=0.005)
+    assert widths[1] < 0.02
+
+
+def test_the_arm_pushes_the_cube(env):
+    start, _ = env.reset(seed=5)
+    x, y = start["object_position_true"][0]
+    observation = move_to(env, start, (x - 0.1, y, 0.15), 4)
+    observation = move_to(env, observation, (x - 0.1, y, 0.0), 5)
+    observation = move_to(env, observation, (x + 0.1, y, 0.0), 7)
+    moved = observation["object_position_true"][0] - start["object_position_true"][0]
+    assert moved[0] > 0.06
+    assert abs(moved[1]) < 0.04
+    assert observation["object_visible"].tolist() == [True]
+    assert error(observation) < 12  # the gripper hides a part of it
+
+
+def test_actions_are_clipped(env, twin):
+    env.reset(seed=8)
+    twin.reset(seed=8)
+    first, second = env.step(np.array([3.0, -7.0, 1.5, -2.0])), twin.step(np.array([1.0, -1.0, 1.0, -1.0]))
+    assert_same(first[0], second[0])
+
+
+def test_same_seed_same_everything(env, twin):
+    assert_same(env.reset(seed=9)[0], twin.reset(seed=9)[0])
+    for action in actions(8):
+        first, second = env.step(action), twin.step(action)
+        assert_same(first[0], second[0])
+        assert first[1:] == second[1:]
+    assert_same(env.reset()[0], twin.reset()[0])
+
+
+def test_other_seed_other_start(env, twin):
+    first, second = env.reset(seed=10)[0], twin.reset(seed=11)[0]
+    for key in ("pixels", "proprio", "goal_position", "object_position_true"):
+        assert not np.array_equal(first[key], second[key])
+
+
+def test_given_goal_does_not_change_the_start(env):
+    drawn, _ = env.reset(seed=5)
+    following, _ = env.reset()
+    given, _ = env.reset(seed=5, options={"goal_position": GOAL})
+    following_given, _ = env.reset()
+    assert not np.array_equal(drawn.pop("goal_position"), given.pop("goal_position"))
+    assert_same(drawn, given)
+    assert_same(following, following_given)
+
+
+def test_given_goal(env):
+    observation, _ = env.reset(options={"goal_position": GOAL})
+    assert np.array_equal(observation["goal_position"], GOAL)
+    assert np.array_equal(env.step(STILL)[0]["goal_position"], GOAL)
+    with pytest.raises(ValueError, match="lies outside the workspace"):
+        env.reset(options={"goal_position": (0.3, 0.0)})
+
+
+# Positions from masks.
+
+
+def test_position_error_over_random_poses(env):
+    """Measured over 300 poses: median 1.9 mm, 95th percentile 4.9 mm."""
+    env.reset(seed=12)
+    random = np.random.default_rng(0)
+    poses = zip(random.uniform(-0.25, 0.25, (40, 2)), random.uniform(0, 2 * np.pi, 40), strict=True)
+    errors = [error(with_cube_at(env, x, y, 0.82, turn)) for (x, y), turn in poses]
+    assert np.median(errors) < 2.5
+    assert np.percentile(errors, 95) < 6
+
+
+@pytest.mark.parametrize("height", [0.87, 0.95, 1.0])
+def test_position_of_a_cube_in_the_air(env, height):
+    env.reset(seed=12)
+    for x, y in [(0.0, 0.1), (-0.1, -0.2), (0.15, -0.15)]:
+        assert error(with_cube_at(env, x, y, height, turn=0.5)) < 7
+
+
+def test_hidden_cube_keeps_its_last_position(env, hide):
+    env.reset(seed=14, options={"goal_position": GOAL})
+    seen, *_ = env.step(STILL)
+    hide()
+    address = env.model.joint("cube_joint0").qposadr[0]
+    env.data.qpos[address] += 0.05
+    hidden, reward, *_ = env.step(STILL)
+    assert hidden["object_visible"].tolist() == [False]
+    assert not hidden["masks"].any()
+    assert np.array_equal(hidden["object_position"], seen["object_position"])
+    assert reward == pytest.approx(-np.linalg.norm(seen["object_position"][0] - GOAL), abs=1e-6)
+    hide(False)
+    again, *_ = env.step(STILL)
+    assert again["object_visible"].tolist() == [True]
+    assert error(again) < 7
+
+
+# Virtual target.
+
+
+def test_virtual_target(env):
+    plain, _ = env.reset(seed=17, options={"goal_position": (-0.1, 0.12)})
+    env.virtual_target = 6
+    try:
+        painted, _ = env.reset(seed=17, options={"goal_position": (-0.1, 0.12)})
+        there, _ = env.reset(seed=17, options={"goal_position": plain["object_position"][0]})
+    finally:
+        env.virtual_target = 0
+    rows, columns = np.nonzero((plain["pixels"] != painted["pixels"]).any(0))
+    column, row = pixel(-0.1, 0.12, 0.82)
+    assert len(rows) == pytest.approx(np.pi * 9, rel=0.2)
+    assert columns.mean() + 0.5 == pytest.approx(column, abs=0.5)
+    assert rows.mean() + 0.5 == pytest.approx(row, abs=0.5)
+    cube = plain["masks"][0]
+    assert np.array_equal(there["pixels"][:, cube], plain["pixels"][:, cube])
+    for key in set(plain) - {"pixels"}:
+        assert np.array_equal(plain[key], painted[key])
+
+
+# Goal observations.
+
+
+def test_goal_observation_shows_the_cube_at_the_goal(env):
+    env.reset(seed=18)
+    for _ in range(3):
+        env.step(np.array([1.0, 0.0, -1.0, 1.0]))  # the arm reaches over the table
+    start = env.goal_observation((0.0, 0.0))
+    for goal in [*env.workspace.grid(4).flatten(0, 1).tolist(), (-0.25, 0.0), (-0.25, -0.25), (0.25, 0.25)]:
+        observation = env.goal_observation(np.array(goal))
+        assert env.observation_space.contains(observation)
+        assert observation["object_position_true"][0] == pytest.approx(np.array(goal), abs=1e-6)
+        assert observation["goal_position"] == pytest.approx(np.array(goal))
+        assert observation["object_visible"].tolist() == [True]
+        assert error(observation) < 8
+        assert np.array_equal(observation["proprio"], start["proprio"])
+        assert not observation["proprio"][7:14].any()
+    # The cube lies on the table.
+    scratch = env._scratch
+    height = scratch.geom_xpos[env.model.geom("cube_g0_vis").id, 2] - env.model.geom("cube_g0_vis").size[2]
+    assert height == pytest.approx(0.8, abs=1e-6)
+
+
+def test_goal_observation_leaves_the_episode_alone(env, twin):
+    env.reset(seed=19)
+    twin.reset(seed=19)
+    for action in actions(6, seed=1):
+        qpos, qvel, time = env.data.qpos.copy(), env.data.qvel.copy(), env.data.time
+        for goal in [(0.2, 0.0), (-0.1, 0.2)]:
+            env.goal_observation(goal)
+        assert np.array_equal(env.data.qpos, qpos)
+        assert np.array_equal(env.data.qvel, qvel)
+        assert env.data.time == time
+        first, second = env.step(action), twin.step(action)
+        assert_same(first[0], second[0])
+        assert first[1:] == second[1:]
+    assert_same(env.reset()[0], twin.reset()[0])
+
+
+# A second cube.
+
+
+def test_distractor_has_a_mask_and_a_position_of_its_own(pair):
+    for seed in range(5):
+        observation, _ = pair.reset(seed=seed)
+        cube, distractor = observation["masks"]
+        assert observation["masks"].shape == (2, 64, 64)
+        assert observation["object_visible"].tolist() == [True, True]
+        assert not (cube & distractor).any()
+        red, _, blue = observation["pixels"][:, distractor].astype(int)
+        assert (blue > 1.5 * red).all()
+        true = observation["object_position_true"]
+        assert np.linalg.norm(true[0] - true[1]) > 0.05
+        assert (np.abs(true[1]) <= 0.15).all()
+        assert max(error(observation, 0), error(observation, 1)) < 10
+        offset = observation["object_position"][0] - observation["goal_position"]
+        assert pair.step(STILL)[1] == pytest.approx(-np.hypot(*offset), abs=0.01)
+
+
+def test_distractor_repeats_with_the_seed_and_stays_in_goal_observations(pair):
+    first, _ = pair.reset(seed=3)
+    other, _ = pair.reset()
+    assert not np.array_equal(first["object_position_true"][1], other["object_position_true"][1])
+    again, _ = pair.reset(seed=3)
+    assert_same(first, again)
+    goal = pair.goal_observation((0.2, -0.2))
+    assert goal["object_position_true"][0] == pytest.approx([0.2, -0.2], abs=1e-6)
+    assert np.array_equal(goal["object_position_true"][1], first["object_position_true"][1])
+
+
+@pytest.mark.parametrize("objects", [(), ("distractor",), ("distractor", "cube"), ("cube", "ball")])
+def test_unknown_objects(objects):
+    with pytest.raises(ValueError, match=r"objects must be \('cube',\) or \('cube', 'distractor'\), got"):
+        CubeMove(objects=objects)
+
+
+# Names, resources and noise.
+
+
+def test_task_describes_the_environment_also_through_json():
+    task = make_task("cube_move", objects=["cube", "distractor"], image_size=16, horizon=9)
+    assert (task.objects, task.proprio, task.action, task.image_size) == (("cube", "distractor"), 19, 4, 16)
+    assert task.workspace == CubeMove.workspace
+    assert task.workspace.contains(torch.tensor(task.workspace.landmarks)).all()
+    assert len(set(task.workspace.landmarks)) == 10
+    again = Task.from_dict(json.loads(json.dumps(task.to_dict())))
+    assert again == task
+
+
+def test_closing_frees_the_context_and_leaves_others_alone(env):
+    before, _ = env.reset(seed=12)
+    other = CubeMove(image_size=16)
+    other.reset(seed=13)
+    other.close()
+    other.close()
+    with pytest.raises(RuntimeError, match="this camera is closed"):
+        other.reset()
+    assert_same(env.reset(seed=12)[0], before)
+
+
+def test_missing_robosuite_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(registry, "find_spec", lambda name: None if name == "robosuite" else True)
+    with pytest.raises(ModuleNotFoundError, match=r"'cube_move' needs robosuite.*'torchrl-ocwm\[robosuite\]'"):
+        make_env("cube_move")
+    monkeypatch.delitem(sys.modules, "torchrl_ocwm.envs.cube_move")
+    monkeypatch.setitem(sys.modules, "robosuite.controllers", None)
+    with pytest.raises(ModuleNotFoundError, match=r"needs robosuite.*'torchrl-ocwm\[robosuite\]'"):
+        importlib.import_module("torchrl_ocwm.envs.cube_move")
+
+
+@pytest.mark.slow
+def test_robosuite_says_nothing_and_keeps_its_hands_off_the_environment():
+    code = (
+        "import os; from torchrl_ocwm.envs import CubeMove; env = CubeMove(image_size=8); env.reset(seed=0);"
+        "env.close(); print(os.environ.get('MUJOCO_GL'))"
+    )
+    environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "DISPLAY")}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert "robosuite" not in done.stderr
+    assert done.stdout == "None\n"
