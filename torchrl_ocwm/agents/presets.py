@@ -12,7 +12,7 @@ AGENTS = {
     "focus": AgentConfig(world_model="object", observed=("proprio", "object_position", "goal_position")),
     "focus_pcp": AgentConfig(world_model="object", goal="position", reward="position_distance", goal_source="uniform"),
     "focus_lcp": AgentConfig(
-        world_model="object", goal="object_latent", reward="latent_similarity", goal_source="uniform"
+        world_model="object", goal="object_latent", reward="latent_chord", goal_source="uniform"
     ),
 }
 
