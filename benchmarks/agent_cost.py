@@ -2,6 +2,7 @@
 
     python benchmarks/agent_cost.py [--agents dreamer focus_lcp ...] [--sizes cpu peer paper] [--threads 2]
         [--rounds 10] [--updates 1] [--budget 60] [--device cpu] [--compile]
+        [--mixed-precision]
 
 Each agent at each size has a process of its own, one after the other, so that its peak memory is its own: the largest
 resident set of the process, Python and PyTorch with it; on a GPU what PyTorch had allocated there. Records are random,
@@ -200,7 +201,8 @@ class CutUpdate:
 
     def __call__(self, batch: TensorDictBase) -> dict[str, float]:
         start = clock(self.device)
-        model_losses, records = self.loss.model_loss(batch.select(*self.loss.in_keys, strict=False))
+        with self._precision():
+            model_losses, records = self.loss.model_loss(batch.select(*self.loss.in_keys, strict=False))
         seconds = {"encoder": self.encoder.seconds, "RSSM": self.rollout.seconds}
         seconds["decoders"] = self.world_model.seconds - sum(seconds.values())
         seconds["imagination"] = timed(lambda: self._imagine(records), self.device)
@@ -211,9 +213,13 @@ class CutUpdate:
         return {**seconds, "other": clock(self.device) - start - sum(seconds.values())}
 
     def _imagine(self, records: TensorDictBase) -> None:
-        actor_losses, imagined = self.loss.actor_loss(self.loss.imagination_start(records.get("next")))
-        value_losses, _ = self.loss.value_loss(imagined.detach())
+        with self._precision():
+            actor_losses, imagined = self.loss.actor_loss(self.loss.imagination_start(records.get("next")))
+            value_losses, _ = self.loss.value_loss(imagined.detach())
         (_total(actor_losses) + _total(value_losses)).backward()
+
+    def _precision(self) -> torch.autocast:
+        return torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=self.stepper.mixed_precision)
 
     def _optimise(self) -> None:
         """The stepper zeroes the gradients before the backward pass, which is the same."""
@@ -240,11 +246,16 @@ def make_update(name: str, size: str, training: Training) -> tuple[Agent, Dreame
     return agent, make_stepper(agent, training)
 
 
+def settings(arguments: argparse.Namespace, **others: Any) -> Training:
+    """How the updates are done."""
+    return Training(device=arguments.device, mixed_precision=arguments.mixed_precision, **others)
+
+
 def measure_whole(batch: TensorDictBase, arguments: argparse.Namespace) -> dict[str, Any]:
     """Seconds per update and of the reference, one each per round, and the peak memory of it all."""
     device = arguments.device
     agent, size = arguments.child
-    _, stepper = make_update(agent, size, Training(device=device, compile=arguments.compile))
+    _, stepper = make_update(agent, size, settings(arguments, compile=arguments.compile))
     reference = make_reference(device)
     if any(stepper.resolve(torch.device(device))):
         stepper.warmup(batch)
@@ -262,7 +273,7 @@ def measure_parts(batch: TensorDictBase, arguments: argparse.Namespace) -> dict[
     """Seconds of each part of an update."""
     device = arguments.device
     agent, size = arguments.child
-    training = Training(device=device, compile=False, cudagraph=False)
+    training = settings(arguments, compile=False, cudagraph=False)
     update = CutUpdate(*make_update(agent, size, training), device)
     update(batch)
     rounds = within(arguments.budget, arguments.rounds, lambda: update(batch))
@@ -354,6 +365,7 @@ def parse() -> argparse.Namespace:
         action=argparse.BooleanOptionalAction,
         help="compile the step, which takes minutes; by default as in training, on a GPU only",
     )
+    parser.add_argument("--mixed-precision", action="store_true", help="products and convolutions in bfloat16")
     parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
     return parser.parse_args()
 
@@ -363,7 +375,8 @@ def main() -> None:
     if arguments.child:
         child(arguments)
         return
-    print(f"torch {torch.__version__}, {arguments.device}, {arguments.threads} threads", end="")
+    precision = "bfloat16" if arguments.mixed_precision else "float32"
+    print(f"torch {torch.__version__}, {arguments.device}, {precision}, {arguments.threads} threads", end="")
     print(f" on {os.cpu_count()} cores; medians of at most {arguments.rounds} rounds of {arguments.updates} updates")
     if any(size in PEER for size in arguments.sizes):
         print(

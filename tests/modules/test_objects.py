@@ -32,6 +32,12 @@ def test_extractor_is_one_mlp_per_id() -> None:
     assert (latents[:, :, 0] - latents[:, :, 1]).abs().max() > 1e-4
 
 
+def test_extractor_of_the_first_instances() -> None:
+    extractor = ObjectLatentExtractor(6, instances=3, features=8, units=16)
+    state, belief = torch.randn(5, 4), torch.randn(5, 2)
+    torch.testing.assert_close(extractor(state, belief, first=2), extractor(state, belief)[:, :2])
+
+
 @pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
 def test_decoder_takes_each_latent_alone(style: Any) -> None:
     decoder = ObjectDecoder(8, 64, cnn_depth=2, cnn_mults=(1, 2, 2, 2), style=style)

@@ -168,12 +168,12 @@ def position_distance_reward(model: WorldModel, _: AgentConfig) -> TensorDictMod
 def latent_similarity_reward(model: WorldModel, config: AgentConfig) -> TensorDictModuleBase:
     """The similarity of the object's latent and the goal latent (paper, r_LCP)."""
     reward = LatentSimilarityReward(distance=config.latent_distance)
-    return TensorDictSequential(_object_centric(model).object_latent(), reward)
+    return TensorDictSequential(_object_centric(model).object_latent(1), reward)
 
 
 def latent_chord_reward(model: WorldModel, _: AgentConfig) -> TensorDictModuleBase:
     """Minus the distance between the directions of the object's latent and the goal latent."""
-    return TensorDictSequential(_object_centric(model).object_latent(), LatentSimilarityReward(distance="chord"))
+    return TensorDictSequential(_object_centric(model).object_latent(1), LatentSimilarityReward(distance="chord"))
 
 
 def _object_centric(model: WorldModel) -> ObjectWorldModel:

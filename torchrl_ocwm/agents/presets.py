@@ -11,9 +11,7 @@ AGENTS = {
     "dreamer_pcp": AgentConfig(goal="position", reward="position_distance", goal_source="uniform"),
     "focus": AgentConfig(world_model="object", observed=("proprio", "object_position", "goal_position")),
     "focus_pcp": AgentConfig(world_model="object", goal="position", reward="position_distance", goal_source="uniform"),
-    "focus_lcp": AgentConfig(
-        world_model="object", goal="object_latent", reward="latent_chord", goal_source="uniform"
-    ),
+    "focus_lcp": AgentConfig(world_model="object", goal="object_latent", reward="latent_chord", goal_source="uniform"),
 }
 
 # fmt: off

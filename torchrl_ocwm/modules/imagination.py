@@ -77,24 +77,19 @@ class ImaginationEnv(DreamerEnv):
             return super().rollout(max_steps, policy, *args, **kwargs)
         assert policy is not None
         step = kwargs["tensordict"].select("latent")
-        latents, actions, rewards = [step["latent"]], [], []
+        transition = self.world_model.get_transition_model_operator()
+        reward = self.world_model.get_reward_operator()
+        latents, actions = [step["latent"]], []
         for _ in range(max_steps):
             step = policy(step)
             actions.append(step["action"])
-            step = self.world_model(step.select("latent", "action").copy())
+            step = transition(step.select("latent", "action").copy()).select("latent")
             latents.append(step["latent"])
-            rewards.append(step["reward"])
-            step = step.select("latent")
-        time = step.ndim
+        time, batch = step.ndim, [*step.batch_size, max_steps]
         states = torch.stack(latents, time)
-        return TensorDict(
-            {
-                "latent": states[..., :-1],
-                "action": torch.stack(actions, time),
-                "next": {"latent": states[..., 1:], "reward": torch.stack(rewards, time)},
-            },
-            [*step.batch_size, max_steps],
-        )
+        after = reward(TensorDict({"latent": states[..., 1:]}, batch)).select("latent", "reward")
+        actions = torch.stack(actions, time)
+        return TensorDict({"latent": states[..., :-1], "action": actions, "next": after}, batch)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:  # noqa: ARG002
         return self.state_spec.rand() if tensordict is None else tensordict.clone()

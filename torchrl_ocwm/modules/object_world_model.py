@@ -140,12 +140,13 @@ class ObjectWorldModel(WorldModel):
     def object_position(self) -> TensorDictModuleBase:
         """Decoded object positions ``object_units`` ``[..., O * D]``, in workspace units."""
         return TensorDictSequential(
-            self.object_latent(), TensorDictModule(self.position_decoder, ["object_latent"], ["object_units"])
+            self.object_latent(self.objects),
+            TensorDictModule(self.position_decoder, ["object_latent"], ["object_units"]),
         )
 
-    def object_latent(self) -> TensorDictModule:
-        """Extracted object latents ``object_latent`` ``[..., O + 1, L]`` of imagined latents."""
-        return TensorDictModule(self.extractor, latent_at(("latent",)), ["object_latent"])
+    def object_latent(self, first: int | None = None) -> TensorDictModule:
+        """Extracted object latents ``object_latent`` ``[..., O + 1, L]`` of imagined latents, or the first of them."""
+        return TensorDictModule(_Instances(self.extractor, first), latent_at(("latent",)), ["object_latent"])
 
 
 class LatentsInImages(nn.Module):
@@ -179,6 +180,17 @@ class _LatentsInEmbedding(nn.Module):
         return self.images.extractor(*self.images.latent(alone.unsqueeze(-2)))
 
 
+class _Instances(nn.Module):
+    """State and belief to the object latents of the first instances ``[..., first, L]``, of all for ``None``."""
+
+    def __init__(self, extractor: ObjectLatentExtractor, first: int | None) -> None:
+        super().__init__()
+        self.extractor, self.first = extractor, first
+
+    def forward(self, state: Tensor, belief: Tensor) -> Tensor:
+        return self.extractor(state, belief, first=self.first)
+
+
 class _ObjectPositions(nn.Module):
     """Object latents ``[..., O + 1, L]`` to positions ``[..., O * D]``; the background has none."""
 
@@ -187,7 +199,8 @@ class _ObjectPositions(nn.Module):
         self.objects, self.mlp = objects, mlp
 
     def forward(self, object_latent: Tensor) -> Tensor:
-        return self.mlp(object_latent[..., : self.objects, :]).flatten(-2)
+        latents = object_latent[..., : self.objects, :].contiguous()  # or a linear layer copies its weights per sample
+        return self.mlp(latents).flatten(-2)
 
 
 class _LatentsAt(nn.Module):

@@ -21,7 +21,8 @@ class ObjectLatentExtractor(nn.Module):
         units: Units of each.
         style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
 
-    Called with state and belief ``[..., any]``; returns ``[..., O + 1, L]``, from one batched pass.
+    Called with state and belief ``[..., any]``; returns ``[..., O + 1, L]``, from one batched pass. With ``first`` it
+    extracts that many of the instances only, ``[..., first, L]``.
 
     Examples:
         >>> extractor = ObjectLatentExtractor(6, instances=3, features=8, units=16)
@@ -46,11 +47,11 @@ class ObjectLatentExtractor(nn.Module):
         self.mlp = make_mlp(style, in_features + instances, features, layers=layers, units=units)
         self.register_buffer("ids", torch.eye(instances), persistent=False)
 
-    def forward(self, *latent: Tensor) -> Tensor:
+    def forward(self, *latent: Tensor, first: int | None = None) -> Tensor:
         scene = torch.cat(latent, -1)
-        batch = scene.shape[:-1]
-        scene = scene.unsqueeze(-2).expand(*batch, self.instances, -1)
-        return self.mlp(scene, self.ids.expand(*batch, -1, -1))
+        batch, ids = scene.shape[:-1], self.ids[:first]
+        scene = scene.unsqueeze(-2).expand(*batch, len(ids), -1)
+        return self.mlp(scene, ids.expand(*batch, -1, -1))
 
 
 class ObjectDecoder(nn.Module):

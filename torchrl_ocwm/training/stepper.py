@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import torch
+from tensordict import TensorDictBase
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LinearLR
 from torchrl.objectives import SoftUpdate
@@ -29,9 +31,22 @@ def make_schedule(optimizer: Optimizer, training: Training) -> LinearLR:
     return LinearLR(optimizer, 1.0, training.final_lr, total_iters=training.updates)
 
 
+class Stepper(DreamerV3OptimizationStepper):
+    """TorchRL's DreamerV3 stepper, which keeps mixed precision to GPUs; this one has it on CPUs too."""
+
+    def _forward_backward(self, sample: TensorDictBase) -> TensorDictBase:
+        device = sample.get(self.loss_module.in_keys[0]).device.type
+        with torch.autocast(device, torch.bfloat16, enabled=self.mixed_precision):
+            losses = self.loss_module(sample)
+        total = sum(value for key, value in losses.items() if isinstance(key, str) and key.startswith("loss_"))
+        self.optimizer.zero_grad(set_to_none=False)
+        total.backward()
+        return losses.detach()
+
+
 def make_stepper(agent: Agent, training: Training) -> DreamerV3OptimizationStepper:
-    """TorchRL's DreamerV3 stepper: forward, backward, optimiser and slow critic."""
-    return DreamerV3OptimizationStepper(
+    """A stepper: forward, backward, optimiser and slow critic."""
+    return Stepper(
         agent.loss,
         make_optimizer(agent),
         SoftUpdate(agent.loss.value_loss, tau=training.target_rate),
