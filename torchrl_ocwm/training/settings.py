@@ -28,8 +28,8 @@ class Training:
             dataset.
         compile: Compile the update; ``None`` does so on a GPU only. Takes minutes.
         cudagraph: Capture the update in a CUDA graph; ``None`` does so on a GPU.
-        mixed_precision: Products and convolutions in bfloat16. Faster where the device has instructions for it, and the model
-            is not small.
+        mixed_precision: Products and convolutions in bfloat16. Faster where the device has instructions for it, and the
+            model is not small.
         final_lr: Share of the learning rates that is left at the last update; they fall linearly. A policy stops within
             millimetres of its goal only with a small one (docs/results/reacher).
         target_rate: Share of the critic that moves into the slow critic at each update.
