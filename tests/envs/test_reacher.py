@@ -2,6 +2,7 @@
 
 import importlib.util
 import warnings
+from contextlib import closing
 from pathlib import Path
 
 import gymnasium
@@ -292,26 +293,29 @@ def load_benchmark():
 
 
 def test_position_error_over_random_poses():
-    errors = load_benchmark().position_errors(100)
+    errors, cost = load_benchmark().measure("reacher", [1, 2], 60, image_size=64, seed=0)
     assert not np.isnan(errors).any()
-    assert np.median(errors) < 3.0
-    assert np.percentile(errors, 95) < 4.5
+    assert np.median(errors, -1) == pytest.approx([2.3, 0.75], rel=0.2)
+    assert (np.percentile(errors, 95, axis=-1) < [4.5, 2.0]).all()
+    assert (cost > 0).all()
 
 
-def test_position_error_sees_hidden_poses_and_wrong_positions(monkeypatch):
-    module = load_benchmark()
+@pytest.mark.parametrize(("visible", "error"), [(True, 5.0), (False, np.nan)])
+def test_position_error_sees_hidden_poses_and_wrong_positions(visible, error):
+    observation = {
+        "object_position": np.array([[0.103, 0.204]]),
+        "object_position_true": np.array([[0.1, 0.2]]),
+        "object_visible": np.array([visible]),
+    }
+    assert load_benchmark().millimetres(observation) == pytest.approx(error, abs=1e-6, nan_ok=True)
 
-    class Wrong(Reacher):
-        def reset(self, **kwargs):
-            observation, info = super().reset(**kwargs)
-            observation["object_position"] = observation["object_position_true"] + np.array([[0.003, 0.004]])
-            observation["object_visible"] = np.array([self.np_random.random() < 0.5])
-            return observation, info
 
-    monkeypatch.setattr(module, "Reacher", Wrong)
-    errors = module.position_errors(20)
-    assert 0 < np.isnan(errors).sum() < 20
-    assert errors[~np.isnan(errors)] == pytest.approx(5.0, abs=1e-3)
+def test_finer_masks_are_sampled_at_the_size_of_the_images(env):
+    with closing(Reacher(mask_scale=3)) as fine:
+        coarse, same = (one.reset(seed=5, options={"goal_position": GOAL})[0] for one in (env, fine))
+    assert np.array_equal(same["pixels"], coarse["pixels"])
+    assert np.array_equal(same["masks"], coarse["masks"])  # with an odd scale the samples are at the same places
+    assert not np.array_equal(same["object_position"], coarse["object_position"])
 
 
 def test_hidden_object_keeps_its_last_position(env, hide):
@@ -477,7 +481,7 @@ def test_bad_actions(env, action, message):
     assert np.array_equal(env.data.qpos, before)
 
 
-@pytest.mark.parametrize("name", ["image_size", "horizon", "action_repeat"])
+@pytest.mark.parametrize("name", ["image_size", "horizon", "action_repeat", "mask_scale"])
 @pytest.mark.parametrize("value", [0, -1])
 def test_sizes_below_one(name, value):
     with pytest.raises(ValueError, match=f"{name} must be at least 1, got {value}"):

@@ -20,8 +20,9 @@ class Frame(NamedTuple):
 
     Args:
         pixels: ``[H, W, 3]`` uint8.
-        geoms: ``[H, W]`` int32, the id of the geom seen at each pixel, -1 where there is none.
-        depth: ``[H, W]`` float32, metres along the optical axis; ``None`` unless asked for.
+        geoms: ``[S * H, S * W]`` int32, the id of the geom seen at each pixel, -1 where there is none; S is the
+            ``mask_scale`` of the camera.
+        depth: ``[S * H, S * W]`` float32, metres along the optical axis; ``None`` unless asked for.
     """
 
     pixels: np.ndarray
@@ -40,6 +41,7 @@ class Camera:
         camera: Name of a camera of the model.
         height: Image height, pixels.
         width: Image width, pixels.
+        mask_scale: How many times finer than the colours segmentation and depth are, in height and width.
         shadows: Draw shadows.
         reflections: Draw reflections.
         multisampling: Samples per pixel of the colour pass, 0 for none.
@@ -68,6 +70,7 @@ class Camera:
         *,
         height: int = 64,
         width: int = 64,
+        mask_scale: int = 1,
         shadows: bool = False,
         reflections: bool = False,
         multisampling: int = 0,
@@ -77,7 +80,7 @@ class Camera:
         if self.camera_id < 0:
             names = [model.camera(index).name for index in range(model.ncam)]
             raise ValueError(f"the model has no camera {camera!r}; it has {names}")
-        self.model, self.height, self.width = model, height, width
+        self.model, self.height, self.width, self.mask_scale = model, height, width, mask_scale
         self._context: Any = None
         self._gl: Any = None
         self._set_up(multisampling)
@@ -88,18 +91,24 @@ class Camera:
         self._options = mujoco.MjvOption()
         self._view = mujoco.MjvCamera()
         self._view.type, self._view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, self.camera_id
-        self._rectangle = mujoco.MjrRect(0, 0, width, height)
+        fine = self._fine_size
+        self._rectangle, self._fine = mujoco.MjrRect(0, 0, width, height), mujoco.MjrRect(0, 0, *fine[::-1])
         self._pixels = np.empty((height, width, 3), np.uint8)
-        self._ids = np.empty((height, width, 3), np.uint8)
-        self._depth = np.empty((height, width), np.float32)
+        self._ids = np.empty((*fine, 3), np.uint8)
+        self._depth = np.empty(fine, np.float32)
+
+    @property
+    def _fine_size(self) -> tuple[int, int]:
+        return self.mask_scale * self.height, self.mask_scale * self.width
 
     def _set_up(self, multisampling: int) -> None:
         """Make the OpenGL context; its buffers take their size and samples from the model, which stays unchanged."""
         vis = self.model.vis
         before = vis.quality.offsamples, vis.global_.offwidth, vis.global_.offheight
-        vis.quality.offsamples, vis.global_.offwidth, vis.global_.offheight = multisampling, self.width, self.height
+        height, width = self._fine_size
+        vis.quality.offsamples, vis.global_.offwidth, vis.global_.offheight = multisampling, width, height
         try:
-            self._gl = context_class()(self.width, self.height)
+            self._gl = context_class()(width, height)
             self._gl.make_current()
             self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
         except Exception as error:  # each OpenGL binding raises an error class of its own
@@ -127,8 +136,8 @@ class Camera:
 
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
-        mujoco.mjr_render(self._rectangle, self._scene, self._context)
-        mujoco.mjr_readPixels(self._ids, self._depth if depth else None, self._rectangle, self._context)
+        mujoco.mjr_render(self._fine, self._scene, self._context)
+        mujoco.mjr_readPixels(self._ids, self._depth if depth else None, self._fine, self._context)
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
         # OpenGL's rows run upwards.
         return Frame(self._pixels[::-1].copy(), self._geoms(), self._metres() if depth else None)

@@ -40,13 +40,15 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         image_size: Height and width of the images, pixels.
         horizon: Steps per episode.
         action_repeat: Simulator control steps per step.
+        mask_scale: How many times finer than the images the segmentation is that positions are read from, in height and
+            width. ``masks`` are samples of it, as large as the images.
         virtual_target: Diameter in pixels of a disc drawn at the goal, 0 for none (paper, "Size matters!").
         camera_options: Passed to :class:`~torchrl_ocwm.envs.Camera`: shadows, reflections, multisampling.
         render_mode: ``"rgb_array"`` makes :meth:`render` return the camera image (H, W, 3).
 
     Raises:
-        ValueError: for a horizon, action repeat or image size below one, a goal outside the workspace, or an action
-            that is not finite or has another shape.
+        ValueError: for a horizon, action repeat, image size or mask scale below one, a goal outside the workspace, or
+            an action that is not finite or has another shape.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
@@ -70,21 +72,27 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         image_size: int = 64,
         horizon: int = 500,
         action_repeat: int = 2,
+        mask_scale: int = 1,
         virtual_target: int = 0,
         camera_options: dict[str, Any] | None = None,
         render_mode: str | None = None,
     ) -> None:
-        for name, value in (("image_size", image_size), ("horizon", horizon), ("action_repeat", action_repeat)):
+        counts = {
+            "image_size": image_size,
+            "horizon": horizon,
+            "action_repeat": action_repeat,
+            "mask_scale": mask_scale,
+        }
+        for name, value in counts.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
         if virtual_target < 0:
             raise ValueError(f"virtual_target is a diameter in pixels, 0 for none; got {virtual_target}")
         self.image_size, self.horizon, self.action_repeat = image_size, horizon, action_repeat
-        self.virtual_target, self.render_mode = virtual_target, render_mode
+        self.mask_scale, self.virtual_target, self.render_mode = mask_scale, virtual_target, render_mode
         self.model, self.data = self._load()
-        self.camera = Camera(
-            self.model, self.camera_name, height=image_size, width=image_size, **(camera_options or {})
-        )
+        size = {"height": image_size, "width": image_size, "mask_scale": mask_scale}
+        self.camera = Camera(self.model, self.camera_name, **size, **(camera_options or {}))
         self._start, self._axes = np.array(self.start), list(self.axes)
         self._geom_ids = [[self.model.geom(name).id for name in names] for names in self.objects.values()]
         self._scratch: mujoco.MjData | None = None
@@ -94,6 +102,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         mujoco.mj_forward(self.model, self.data)
         self._plane = None if self.plane is None else torch.tensor(self.plane)
         self._intrinsics = torch.from_numpy(self.camera.intrinsics)
+        self._mask_intrinsics = self._intrinsics * torch.tensor([[mask_scale], [mask_scale], [1.0]])
         self._extrinsics = torch.from_numpy(self.camera.extrinsics(self.data))
         self.observation_space = self._observation_space()  # type: ignore[assignment]
         self.action_space = spaces.Box(-1.0, 1.0, self._action_shape(), np.float32)
@@ -229,10 +238,11 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     def _observe(self, data: mujoco.MjData, goal: np.ndarray | None = None) -> Observation:
         goal = self._goal if goal is None else goal
         frame = self.camera.render(data, depth=self._plane is None)
-        masks = np.array([_any_of(frame.geoms, ids) for ids in self._geom_ids])
+        fine_masks = np.array([_any_of(frame.geoms, ids) for ids in self._geom_ids])
+        masks = fine_masks[:, self.mask_scale // 2 :: self.mask_scale, self.mask_scale // 2 :: self.mask_scale]
         world, visible = masks_to_positions(
-            torch.from_numpy(masks),
-            self._intrinsics,
+            torch.from_numpy(fine_masks),
+            self._mask_intrinsics,
             self._extrinsics,
             depth=None if frame.depth is None else torch.from_numpy(frame.depth[None] + self.depth_offset),
             plane=self._plane,
@@ -241,7 +251,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         estimate = self._relative(world.numpy())
         return {
             "pixels": self._paint_target(frame.pixels, masks[0], goal).transpose(2, 0, 1),
-            "masks": masks,
+            "masks": masks.copy(),
             "proprio": self._proprio(data).astype(np.float32),
             "object_position": estimate if seen.all() else np.where(seen[:, None], estimate, self._last_seen),
             "object_visible": seen,
