@@ -44,7 +44,8 @@ def make_env(
         num_envs: With more than one, that many processes step in parallel (:class:`~torchrl.envs.ParallelEnv`).
         seed: Seeds the environments, each differently.
         device: Where observations are put.
-        options: Passed to the environment: image_size, horizon, action_repeat, mask_scale, virtual_target, camera_options.
+        options: Passed to the environment: image_size, horizon, action_repeat, mask_scale, virtual_target,
+            camera_options.
 
     Returns:
         An environment with the keys of the data contract (docs/data.md) and ``is_init``. The goal of an episode can be
