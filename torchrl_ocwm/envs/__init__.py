@@ -19,6 +19,7 @@ from torchrl_ocwm.envs.workspace import Workspace
 if TYPE_CHECKING:
     from torchrl_ocwm.envs.camera import Camera, Frame
     from torchrl_ocwm.envs.cube_move import CubeMove
+    from torchrl_ocwm.envs.meta_world import PickPlace, ShelfPlace
     from torchrl_ocwm.envs.positioning import PositioningEnv
     from torchrl_ocwm.envs.reacher import Reacher
 
@@ -28,8 +29,10 @@ __all__ = [
     "CubeMove",
     "Frame",
     "MaskToPosition",
+    "PickPlace",
     "PositioningEnv",
     "Reacher",
+    "ShelfPlace",
     "Task",
     "Workspace",
     "hold_last_seen",
@@ -44,8 +47,10 @@ _LAZY = {
     "Camera": "camera",
     "CubeMove": "cube_move",
     "Frame": "camera",
+    "PickPlace": "meta_world",
     "PositioningEnv": "positioning",
     "Reacher": "reacher",
+    "ShelfPlace": "meta_world",
 }
 
 if find_spec("gymnasium") is not None:

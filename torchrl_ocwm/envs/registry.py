@@ -26,6 +26,10 @@ class Environment(NamedTuple):
 ENVIRONMENTS = {
     "reacher": Environment("ocwm/Reacher-v0", "torchrl_ocwm.envs.reacher:Reacher", "dm-control", "dm_control"),
     "cube_move": Environment("ocwm/CubeMove-v0", "torchrl_ocwm.envs.cube_move:CubeMove", "robosuite", "robosuite"),
+    "shelf_place": Environment(
+        "ocwm/ShelfPlace-v0", "torchrl_ocwm.envs.meta_world:ShelfPlace", "metaworld", "metaworld"
+    ),
+    "pick_place": Environment("ocwm/PickPlace-v0", "torchrl_ocwm.envs.meta_world:PickPlace", "metaworld", "metaworld"),
 }
 
 
