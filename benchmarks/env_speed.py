@@ -1,9 +1,10 @@
 """Environment steps per second beside the bare minimum: physics, one RGB and one segmentation render, by hand.
 
-    python benchmarks/env_speed.py [--rounds 30] [--steps 200] [--image-size 64]
+    MUJOCO_GL=egl python benchmarks/env_speed.py [--env reacher] [--rounds 30] [--steps 200] [--image-size 64] [--workers 2]
 
-Both run in one process, in short turns, so that a noisy machine slows both. The minimum uses ``mujoco.Renderer`` with
-the same flags: no shadows, no reflections, no multisampling. The last row adds TorchRL's wrapper.
+Both run in one process, in short turns, so that a noisy machine slows both. The minimum steps the same simulator and
+renders with ``mujoco.Renderer`` and the same flags: no shadows, no reflections, no multisampling. The next row adds
+TorchRL's wrapper, the last one steps several environments, a process each (0: no such row).
 """
 
 from __future__ import annotations
@@ -12,31 +13,52 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 
+import gymnasium
 import mujoco
 import numpy as np
 import torch
+from torchrl.envs import EnvBase
 
-from torchrl_ocwm.envs import Reacher, make_env
+from torchrl_ocwm.envs import ENVIRONMENTS, make_env
+from torchrl_ocwm.envs.positioning import PositioningEnv
 
 
-def minimum(env: Reacher, renderer: mujoco.Renderer) -> Callable[[], None]:
-    """Physics and two renders of the same model, and nothing else."""
-    model, data = env.model, mujoco.MjData(env.model)
+def make_one(name: str, image_size: int) -> PositioningEnv:
+    env = gymnasium.make(ENVIRONMENTS[name].id, image_size=image_size, horizon=10**9).unwrapped
+    env.reset(seed=0)
+    return env
+
+
+def make_renderer(env: PositioningEnv) -> mujoco.Renderer:
+    env.model.vis.quality.offsamples = 0
+    renderer = mujoco.Renderer(env.model, env.image_size, env.image_size)
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+    return renderer
+
+
+def minimum(env: PositioningEnv, renderer: mujoco.Renderer, action: np.ndarray) -> Callable[[], None]:
+    """Physics and two renders, and nothing else."""
 
     def step() -> None:
-        data.ctrl[:] = 0.3
         for _ in range(env.action_repeat):
-            mujoco.mj_step(model, data)
-        renderer.update_scene(data, env.camera_name)
+            env._step_simulator(action)
+        renderer.update_scene(env.data, env.camera_name)
         renderer.render()
         renderer.enable_segmentation_rendering()
         renderer.render()
         renderer.disable_segmentation_rendering()
 
     return step
+
+
+def torchrl_step(env: EnvBase, action: np.ndarray) -> Callable[[], object]:
+    """A step of TorchRL's environment, or of several in parallel."""
+    actions = torch.tensor(action, dtype=torch.float32).expand(*env.batch_size, -1)
+    tensordict = env.reset().set("action", actions)
+    return lambda: env.step(tensordict)
 
 
 def seconds(step: Callable[[], object], steps: int) -> float:
@@ -48,39 +70,41 @@ def seconds(step: Callable[[], object], steps: int) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", choices=ENVIRONMENTS, default="reacher")
     parser.add_argument("--rounds", type=int, default=30)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--image-size", type=int, default=64)
+    parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
 
-    env = Reacher(image_size=arguments.image_size, horizon=10**9)
-    env.reset(seed=0)
-    action = np.full(2, 0.3)
-    wrapped = make_env("reacher", image_size=arguments.image_size, horizon=10**9, seed=0)
-    tensordict = wrapped.reset().set("action", torch.full((2,), 0.3))
-    env.model.vis.quality.offsamples = 0
-    renderer = mujoco.Renderer(env.model, env.image_size, env.image_size)
-    turns: dict[str, Callable[[], object]] = {
-        "minimum": minimum(env, renderer),
-        "gymnasium environment": lambda: env.step(action),
-        "TorchRL environment": lambda: wrapped.step(tensordict),
-    }
-    times: dict[str, list[float]] = {name: [] for name in turns}
-    for step in turns.values():
-        seconds(step, 50)
-    for _ in range(arguments.rounds):
-        for name, step in turns.items():
-            times[name].append(seconds(step, arguments.steps))
+    name, size, workers = arguments.env, arguments.image_size, arguments.workers
+    with ExitStack() as stack:
+        by_hand, env = (stack.enter_context(closing(make_one(name, size))) for _ in range(2))
+        renderer = stack.enter_context(closing(make_renderer(by_hand)))
+        action = np.full(env.action_space.shape, 0.3)
+        several = f"{workers} processes"
+        turns: dict[str, Callable[[], object]] = {
+            "minimum": minimum(by_hand, renderer, action),
+            "gymnasium environment": lambda: env.step(action),
+        }
+        for turn, number in (("TorchRL environment", 1), (several, workers)):
+            if number:
+                made = make_env(name, num_envs=number, image_size=size, horizon=10**9, seed=0)
+                turns[turn] = torchrl_step(stack.enter_context(closing(made)), action)
+        for step in turns.values():
+            seconds(step, 20)
+        times: dict[str, list[float]] = {turn: [] for turn in turns}
+        for _ in range(arguments.rounds):
+            for turn, step in turns.items():
+                frames = workers if turn == several else 1
+                times[turn].append(seconds(step, arguments.steps) / frames)
 
-    print(f"Reacher, {arguments.image_size} x {arguments.image_size}, median of {arguments.rounds} turns")
+    print(f"{name}, {size} x {size}, median of {arguments.rounds} turns of {arguments.steps} steps")
     print(f"{'':24}{'steps/s':>10}{'of the minimum':>16}")
-    for name, values in times.items():
+    for turn, values in times.items():
         ratio = statistics.median(low / value for low, value in zip(times["minimum"], values, strict=True))
-        print(f"{name:24}{1 / statistics.median(values):10.0f}{ratio:16.2f}")
-    renderer.close()
-    wrapped.close()
-    env.close()
+        print(f"{turn:24}{1 / statistics.median(values):10.1f}{ratio:16.2f}")
 
 
 if __name__ == "__main__":

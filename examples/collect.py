@@ -1,6 +1,9 @@
-"""Collect a dataset of smooth random actions: ``python examples/collect.py env=reacher steps=100000``.
+"""Collect a dataset: ``python examples/collect.py env=reacher steps=100000``.
 
-Can be stopped at any moment and run again: it goes on where it was.
+Can be stopped at any moment and run again: it goes on where it was. Run with another policy, it goes on with that one:
+
+    python examples/collect.py env=cube_move steps=50000 policy=scripted
+    python examples/collect.py env=cube_move steps=100000 policy=random
 """
 
 from __future__ import annotations
@@ -19,11 +22,18 @@ def main(config: DictConfig) -> None:
         config.dataset,
         config.env.name,
         config.steps,
+        policy=config.policy,
         workers=config.workers,
         seed=config.seed,
         options=OmegaConf.to_container(config.env.options, resolve=True),
     )
-    print(f"{dataset.path}: {dataset.num_steps} steps in {len(dataset.episode_lengths)} episodes")
+    index = dataset.metadata
+    policies = ", ".join(f"{number} {policy}" for policy, number in index.get("policies", {}).items())
+    print(f"{dataset.path}: {dataset.num_steps} steps in {len(dataset.episode_lengths)} episodes ({policies})")
+    for name, seen in index["coverage"].items():
+        print(f"{name}: moves in {seen['moves']:.0%} of the steps, visits {seen['visited']:.0%} of the workspace")
+    if index.get("failures"):
+        print(f"the simulator failed {index['failures']} times")
 
 
 if __name__ == "__main__":

@@ -5,9 +5,12 @@ import sys
 
 import pytest
 import torch
-from torchrl.collectors import Collector
+from torchrl.checkpoint import Checkpoint, CheckpointError
+from torchrl.collectors import Collector, MultiSyncCollector
 
-from torchrl_ocwm.data import DatasetError, EpisodeDataset
+from torchrl_ocwm import build_agent
+from torchrl_ocwm.agents.checkpoint import describe
+from torchrl_ocwm.data import DatasetError, EpisodeDataset, ScriptedPolicy, object_coverage
 from torchrl_ocwm.data.collect import collect
 from torchrl_ocwm.envs import Reacher, Task, make_task
 
@@ -27,6 +30,10 @@ class InThisProcess(Collector):
 
     def __init__(self, environments, policy, **options):
         super().__init__(environments[0], policy, **options)
+
+    def set_seed(self, seed, static_seed=False):
+        super().set_seed(seed, static_seed)
+        self.reset()  # seeding resets the simulator; workers look again, too
 
 
 @pytest.fixture
@@ -133,7 +140,7 @@ def test_seed_repeats_the_episodes(tmp_path, no_processes):
 
 
 def test_interrupted_before_the_first_episode(tmp_path, no_processes, monkeypatch):
-    def stop(*arguments):
+    def stop(*arguments, **metadata):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
@@ -147,11 +154,11 @@ def test_interrupted_before_the_first_episode(tmp_path, no_processes, monkeypatc
 def test_interrupted_later_keeps_what_is_there(tmp_path, no_processes, monkeypatch):
     append, calls = EpisodeDataset.append, []
 
-    def stop_at_the_third(dataset, records):
+    def stop_at_the_third(dataset, records, **metadata):
         calls.append(records)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        append(dataset, records)
+        append(dataset, records, **metadata)
 
     with monkeypatch.context() as patch:
         patch.setattr(EpisodeDataset, "append", stop_at_the_third)
@@ -174,6 +181,117 @@ def test_folder_with_other_options(collected, no_collector, options):
     message = rf"{collected.path}: holds a dataset of 'reacher' with options \{{'horizon': 20, .*choose another folder"
     with pytest.raises(DatasetError, match=message):
         collect(collected.path, "reacher", 1000, options=options, progress=False)
+
+
+def test_index_counts_the_episodes_of_each_policy(tmp_path, no_processes):
+    collect(tmp_path / "data", "reacher", 40, policy="scripted", options=OPTIONS, progress=False)
+    dataset = collect(tmp_path / "data", "reacher", 100, policy="random", options=OPTIONS, progress=False)
+    assert dataset.metadata["policies"] == {"scripted": 2, "random": 3}
+    assert dataset.metadata["failures"] == 0
+    assert EpisodeDataset.open(tmp_path / "data").metadata == dataset.metadata
+
+
+def test_index_says_how_much_there_is_to_see(tmp_path, no_processes):
+    """Also that of a dataset which was continued, or collected before there was such a thing."""
+    dataset = collect(tmp_path / "data", "reacher", 40, options=OPTIONS, progress=False)
+    first = dataset.metadata["coverage"]
+    task = make_task("reacher", **OPTIONS)
+    position = dataset.records["next", "object_position_true"][:, 0]
+    assert first == {"finger": object_coverage(position, dataset.episode_lengths, task.workspace)._asdict()}
+    dataset.annotate(coverage=None)
+    assert collect(tmp_path / "data", "reacher", 40, options=OPTIONS, progress=False).metadata["coverage"] == first
+    more = collect(tmp_path / "data", "reacher", 200, options=OPTIONS, progress=False).metadata["coverage"]
+    assert more["finger"]["visited"] > first["finger"]["visited"]
+
+
+def test_scripted_policy_goes_where_the_goals_are(tmp_path, no_processes):
+    options = {"horizon": 80, "image_size": 32}
+    collect(tmp_path / "data", "reacher", 800, policy=ScriptedPolicy(2, random_share=0), options=options, progress=False)
+    dataset = EpisodeDataset.open(tmp_path / "data")
+    assert dataset.metadata["policies"] == {"ScriptedPolicy": 10}
+    nearest = [
+        (frames["object_position_true"][:, 0] - frames["goal_position"]).norm(dim=-1).min().item()
+        for frames in (episode["next"] for episode in episodes(dataset))
+        if 0.05 < frames["goal_position"][0].norm() < 0.24
+    ]
+    assert len(nearest) > 3
+    assert max(nearest) < 0.02
+
+
+def test_checkpoint_as_policy(tmp_path, no_processes):
+    task = make_task("reacher", **OPTIONS)
+    agent = build_agent("dreamer_pcp", task, size="debug")
+    checkpoint = Checkpoint(agent=describe(agent), loss_module=agent.loss, format="archive").save(tmp_path / "checkpoint.zip")
+    dataset = collect(tmp_path / "data", "reacher", 20, policy=checkpoint, options=OPTIONS, progress=False)
+    assert dataset.metadata["policies"] == {str(checkpoint): 1}
+    assert dataset.records["action"][1:].std() > 0
+    other = {**OPTIONS, "virtual_target": 4}
+    with pytest.raises(ValueError, match=r"checkpoint\.zip: the agent was trained for 'reacher' with options \{.*not for"):
+        collect(tmp_path / "other", "reacher", 20, policy=checkpoint, options=other, progress=False)
+
+
+def test_unknown_policy(tmp_path, no_collector):
+    with pytest.raises(ValueError, match="unknown policy 'rnd'; there are random, scripted and checkpoint files"):
+        collect(tmp_path / "data", "reacher", 20, policy="rnd", options=OPTIONS, progress=False)
+
+
+def test_file_that_is_no_checkpoint(tmp_path, no_collector):
+    (tmp_path / "file").write_text("nothing")
+    with pytest.raises(CheckpointError, match="not a checkpoint"):
+        collect(tmp_path / "data", "reacher", 20, policy=tmp_path / "file", options=OPTIONS, progress=False)
+
+
+class FailsSometimes(InThisProcess):
+    """A collector that breaks after its first episode."""
+
+    def __iter__(self):
+        yield next(super().__iter__())
+        raise RuntimeError("At least one process failed")
+
+
+def test_failed_collector_is_replaced(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(collect_module, "MultiSyncCollector", FailsSometimes)
+    dataset = collect(tmp_path / "data", "reacher", 60, options=OPTIONS, progress=False)
+    assert dataset.episode_lengths == [21, 21, 21]
+    assert dataset.metadata["failures"] == 2
+    assert "the simulator failed (At least one process failed); its processes are replaced" in capsys.readouterr().out
+    actions = torch.stack([episode["action"] for episode in episodes(dataset)])
+    assert len(actions.unique(dim=0)) == 3  # not the same random numbers over again
+
+
+def test_simulator_that_fails_again_and_again(tmp_path, monkeypatch):
+    tries = []
+
+    def fail(*arguments, **options):
+        tries.append(1)
+        raise RuntimeError("no screen")
+
+    monkeypatch.setattr(collect_module, "MultiSyncCollector", fail)
+    with pytest.raises(RuntimeError, match="the simulator failed 4 times without an episode: no screen"):
+        collect(tmp_path / "data", "reacher", 60, options=OPTIONS, progress=False)
+    assert len(tries) == 4
+
+
+def test_killed_process_is_replaced(tmp_path, monkeypatch):
+    """With real processes: one is killed while the first episode is stored."""
+    append, collectors = EpisodeDataset.append, []
+
+    def remember(*arguments, **options):
+        collectors.append(MultiSyncCollector(*arguments, **options))
+        return collectors[-1]
+
+    def kill_once(dataset, records, **metadata):
+        if len(dataset.episode_lengths) == 0:
+            collectors[0].procs[0].kill()
+        append(dataset, records, **metadata)
+
+    monkeypatch.setattr(collect_module, "MultiSyncCollector", remember)
+    monkeypatch.setattr(EpisodeDataset, "append", kill_once)
+    dataset = collect(tmp_path / "data", "reacher", 600, options=OPTIONS, progress=False)
+    assert set(dataset.episode_lengths) == {21}
+    assert dataset.num_steps >= 600
+    assert dataset.metadata["failures"] == 1
+    assert len(collectors) == 2
 
 
 def test_foreign_index(tmp_path, no_collector):

@@ -1,10 +1,10 @@
-"""Smooth random actions: a first-order autoregressive process that starts anew with each episode."""
+"""Smooth random actions, a first-order autoregressive process that starts anew with each episode; scripted ones."""
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_ocwm.data import SmoothRandomPolicy
+from torchrl_ocwm.data import ScriptedPolicy, SmoothRandomPolicy
 
 
 def act(policy: SmoothRandomPolicy, steps: int, batch: int, *, resets: tuple[int, ...] = (0,)) -> torch.Tensor:
@@ -95,3 +95,55 @@ def test_other_keys():
 def test_bad_time_constants(shortest, longest):
     with pytest.raises(ValueError, match=f"1 <= shortest <= longest, got {shortest} and {longest}"):
         SmoothRandomPolicy(2, shortest=shortest, longest=longest)
+
+
+def scripted(policy: ScriptedPolicy, steps: int, batch: int, action: float) -> TensorDict:
+    """``[T, B]`` what the policy wrote, with a scripted action that is always the same."""
+    tensordict = TensorDict({"is_init": torch.zeros(batch, 1, dtype=torch.bool)}, [batch])
+    tensordict["scripted_action"] = torch.full((batch, policy.random.action_dim), action)
+    written = []
+    for step in range(steps):
+        tensordict["is_init"] = torch.full((batch, 1), step == 0)
+        written.append(policy(tensordict).clone())
+    return torch.stack(written)
+
+
+def test_script_alone():
+    written = scripted(ScriptedPolicy(3, noise=0.0, random_share=0.0), 10, 5, 0.7)
+    assert (written["action"] == 0.7).all()
+
+
+def test_share_and_length_of_random_stretches():
+    torch.manual_seed(0)
+    written = scripted(ScriptedPolicy(1, noise=0.0, random_share=0.3, stretch=5.0), 200, 1000, 0.25)
+    random = (written["action"] != 0.25).squeeze(-1)
+    assert random.float().mean(1).tolist() == pytest.approx([0.3] * 200, abs=0.06)  # from the first step on
+    assert random.float().mean().item() == pytest.approx(0.3, abs=0.01)
+    begins = random[1:] & ~random[:-1]
+    assert (random[1:].sum() / begins.sum()).item() == pytest.approx(5.0, rel=0.05)
+    # A random stretch is the smooth random policy's.
+    actions = SmoothRandomPolicy(1, action_key=("exploration", "random"))
+    expected = actions.scale * written["exploration", "noise"].clamp(-1, 1)
+    assert torch.equal(written["action"][random], expected[random])
+
+
+def test_noise_on_scripted_actions():
+    torch.manual_seed(0)
+    written = scripted(ScriptedPolicy(2, noise=0.1, random_share=0.0), 300, 400, 0.5)
+    level = written["exploration", "level"]
+    assert torch.equal(level, level[:1].expand_as(level))  # one for an episode
+    assert level.mean().item() == pytest.approx(0.5, abs=0.05)
+    deviation = (written["action"] - 0.5) / written["exploration", "noise"]
+    assert deviation.flatten().tolist() == pytest.approx((0.1 * level).expand_as(deviation).flatten().tolist(), abs=1e-3)
+
+
+def test_noise_does_not_leave_the_bounds():
+    actions = scripted(ScriptedPolicy(2, noise=1.0, random_share=0.0), 50, 50, 0.9)["action"]
+    assert actions.max() == 1
+    assert actions.min() >= -1
+
+
+@pytest.mark.parametrize("options", [{"random_share": 1.0}, {"random_share": -0.1}, {"stretch": 0.5}])
+def test_impossible_stretches(options):
+    with pytest.raises(ValueError, match=r"random_share must lie in \[0, 1\) and stretch be at least 1"):
+        ScriptedPolicy(2, **options)

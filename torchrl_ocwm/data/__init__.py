@@ -1,18 +1,23 @@
 """What is kept: collect, store, load, slice."""
 
+from torchrl_ocwm.data.coverage import Coverage, dataset_coverage, object_coverage
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
 from torchrl_ocwm.data.memory import release_pages
-from torchrl_ocwm.data.policies import SmoothRandomPolicy
+from torchrl_ocwm.data.policies import ScriptedPolicy, SmoothRandomPolicy
 from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.relabel import RelabelGoals
 from torchrl_ocwm.data.replay import make_replay_buffer
 
 __all__ = [
+    "Coverage",
     "DatasetError",
     "EpisodeDataset",
     "RelabelGoals",
+    "ScriptedPolicy",
     "SmoothRandomPolicy",
+    "dataset_coverage",
     "episode_to_records",
     "make_replay_buffer",
+    "object_coverage",
     "release_pages",
 ]

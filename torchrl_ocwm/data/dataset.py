@@ -130,8 +130,8 @@ class EpisodeDataset:
         lengths = torch.tensor(self.episode_lengths, dtype=torch.long)
         return torch.arange(len(lengths)).repeat_interleave(lengths)
 
-    def append(self, records: TensorDictBase) -> None:
-        """Add the records ``[T + 1]`` of one episode.
+    def append(self, records: TensorDictBase, **metadata: Any) -> None:
+        """Add the records ``[T + 1]`` of one episode, and in the same moment change ``metadata`` of the index.
 
         Raises:
             DatasetError: if the episode does not start with ``is_init``, holds NaN or infinity, has other keys, shapes
@@ -143,10 +143,22 @@ class EpisodeDataset:
             if end > len(self._frames):
                 self._resize(end + int(_GROWTH * start))
             self._frames[start:end] = records
-            self._commit({**self._index, "records": end, "episode_lengths": [*self.episode_lengths, len(records)]})
+            lengths = [*self.episode_lengths, len(records)]
+            self._commit({**self._index, **metadata, "records": end, "episode_lengths": lengths})
         except OSError as error:
             raise DatasetError(f"{self.path}: cannot write ({error.strerror or error})") from error
         release_pages(self._frames)
+
+    def annotate(self, **metadata: Any) -> None:
+        """Keep something else in the index; must fit in JSON.
+
+        Raises:
+            DatasetError: if it cannot be written.
+        """
+        try:
+            self._commit({**self._index, **metadata})
+        except OSError as error:
+            raise DatasetError(f"{self.path}: cannot write ({error.strerror or error})") from error
 
     def trim(self) -> None:
         """Give back the room that was kept for more episodes."""

@@ -13,6 +13,7 @@ if find_spec("mujoco") is not None:
 
 from torchrl_ocwm.envs.positions import MaskToPosition, hold_last_seen, mask_centroid, masks_to_positions
 from torchrl_ocwm.envs.registry import ENVIRONMENTS, make_env, make_task
+from torchrl_ocwm.envs.scripted import ScriptedAction
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.envs.workspace import Workspace
 
@@ -32,6 +33,7 @@ __all__ = [
     "PickPlace",
     "PositioningEnv",
     "Reacher",
+    "ScriptedAction",
     "ShelfPlace",
     "Task",
     "Workspace",

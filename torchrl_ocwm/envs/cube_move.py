@@ -51,6 +51,10 @@ _GEOMS = {"cube": ("cube_g0_vis",), "distractor": ("distractor_g0_vis",)}
 _TABLE = 0.8  # metres, height of its top
 _CAMERA_SHIFT = (0.2, 0.0, 0.4)  # metres
 _COLLISION_GROUP = 0
+# Of the scripted policy, metres.
+_STEP = 0.05  # asked for by an action of 1
+_NEAR, _HOVER, _LIFT = 0.015, 0.1, 0.04
+_OPEN, _STILL = 0.035, 0.01  # of a finger, metres and metres per second
 _CUBE_SIZE_SEED = 0  # robosuite draws the edges of the cube when it loads the model
 
 
@@ -128,6 +132,7 @@ class CubeMove(PositioningEnv):
         self._arm = [joint.qposadr[0] for joint in joints]
         self._arm_velocity = [joint.dofadr[0] for joint in joints]
         self._fingers = [joint.qposadr[0] for joint in fingers]
+        self._finger_velocity = fingers[0].dofadr[0]
         self._gripper = model.site("gripper0_right_grip_site").id
         self._cube = model.joint("cube_joint0").qposadr[0]
         return model, data
@@ -157,6 +162,19 @@ class CubeMove(PositioningEnv):
         height = _TABLE + self.model.geom_size[self._geom_ids[0][0], 2]
         data.qpos[self._cube : self._cube + 7] = *(self._start[:2] + position), height, 1, 0, 0, 0
         data.qvel[:] = 0
+
+    def _scripted_action(self, goal: np.ndarray) -> np.ndarray:
+        """Grasp the cube from above and carry it, lifted a little."""
+        cube, gripper = self._true_position(self.data)[0], self.data.site_xpos[self._gripper]
+        off, grip = cube - gripper, -1.0
+        aside = np.linalg.norm(off[:2])
+        if aside > _NEAR:  # fly over the cube, unless it is all but there
+            off[2] += _HOVER
+        elif abs(off[2]) < _NEAR:
+            grip = 1.0
+            if self.data.qpos[self._fingers[0]] < _OPEN and abs(self.data.qvel[self._finger_velocity]) < _STILL:
+                off = np.array([*(self._start[:2] + goal), _TABLE + _LIFT]) - cube
+        return np.array([*off / _STEP, grip])
 
 
 class _Table(Lift):

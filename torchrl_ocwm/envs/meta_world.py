@@ -121,18 +121,16 @@ class _MetaWorld(PositioningEnv):
         data.qpos[self._object_qpos : self._object_qpos + 7] = *place, 1, 0, 0, 0
         data.qvel[-6:] = 0
 
-    def scripted_action(self) -> np.ndarray:
-        """Meta-World's scripted policy for pick-place: grasp the object and carry it to the goal of the episode.
-
-        The policy brings the hand to a goal. It is given one that is off by as much as the hand is off the object.
-        """
+    def _scripted_action(self, goal: np.ndarray) -> np.ndarray:
+        # Meta-World's policy for pick-place brings the hand to a goal: it is told one that is off by as much as the
+        # hand is off the object.
         hand, thing = self.data.xpos[self._hand], self.data.xpos[self._object]
         state = np.zeros(39)
         state[:3], state[3], state[4:7] = hand, min(self._opening(self.data) / 0.1, 1), thing
-        state[-3:] = self._world(self._goal) + hand - thing
+        state[-3:] = self._world(goal) + hand - thing
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it warns about each action that is to be clipped
-            return self._policy.get_action(state).clip(-1, 1)
+            return self._policy.get_action(state)
 
 
 class ShelfPlace(_MetaWorld):

@@ -136,6 +136,23 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     def _action_shape(self) -> tuple[int, ...]:
         return (self.model.nu,)
 
+    def scripted_action(self, goal_position: np.ndarray | None = None) -> np.ndarray:
+        """The action (A,) of a hand-written policy that brings the first object to a goal, from the true state.
+
+        Args:
+            goal_position: (D,) metres; the goal of the episode by default.
+
+        Raises:
+            ValueError: for a goal outside the workspace.
+            NotImplementedError: if the environment has no such policy.
+        """
+        goal = self._goal if goal_position is None else self._check_goal(goal_position)
+        return self._scripted_action(goal).clip(-1, 1).astype(np.float32)
+
+    def _scripted_action(self, goal: np.ndarray) -> np.ndarray:
+        """What :meth:`scripted_action` does, without bounds; an environment may go without."""
+        raise NotImplementedError(f"{type(self).__name__} has no scripted policy; collect with policy=random")
+
     # Gymnasium's interface.
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:

@@ -18,6 +18,7 @@ except ModuleNotFoundError as error:
 
 _LINK = 0.12  # metres, both links
 _WRIST_LIMIT = np.deg2rad(160)
+_STIFFNESS, _DAMPING = 3.0, 0.2  # of the scripted policy, torque per radian and per radian per second
 _REACH = (2 * _LINK * float(np.cos(_WRIST_LIMIT / 2)), 2 * _LINK)
 
 
@@ -88,8 +89,20 @@ class Reacher(PositioningEnv):
         return data.geom_xpos[self._geom_ids[0]]
 
     def _teleport(self, data: mujoco.MjData, position: np.ndarray) -> None:
-        # Two equal links: the elbow angle follows from the distance, the shoulder from the direction.
-        distance = float(np.clip(np.linalg.norm(position), *_REACH))
-        wrist = 2 * np.arccos(np.clip(distance / (2 * _LINK), 0, 1))
-        data.qpos[:] = np.arctan2(position[1], position[0]) - wrist / 2, wrist
+        data.qpos[:] = _joint_angles(position)
         data.qvel[:] = 0
+
+    def _scripted_action(self, goal: np.ndarray) -> np.ndarray:
+        error = _joint_angles(goal) - self.data.qpos
+        error[0] = (error[0] + np.pi) % (2 * np.pi) - np.pi  # the shoulder turns freely
+        return _STIFFNESS * error - _DAMPING * self.data.qvel
+
+
+def _joint_angles(position: np.ndarray) -> np.ndarray:
+    """Angles (2,) that bring the finger tip to a position, or as near as can be.
+
+    Two equal links: the elbow angle follows from the distance, the shoulder from the direction.
+    """
+    distance = float(np.clip(np.linalg.norm(position), *_REACH))
+    wrist = 2 * np.arccos(np.clip(distance / (2 * _LINK), 0, 1))
+    return np.array([np.arctan2(position[1], position[0]) - wrist / 2, wrist])
