@@ -1,6 +1,7 @@
 """Environment steps per second beside the bare minimum: physics, one RGB and one segmentation render, by hand.
 
-    MUJOCO_GL=egl python benchmarks/env_speed.py [--env reacher] [--rounds 30] [--steps 200] [--image-size 64] [--workers 2]
+    MUJOCO_GL=egl python benchmarks/env_speed.py [--env reacher] [--rounds 30] [--steps 200] [--image-size 64]
+        [--workers 2]
 
 Both run in one process, in short turns, so that a noisy machine slows both. The minimum steps the same simulator and
 renders with ``mujoco.Renderer`` and the same flags: no shadows, no reflections, no multisampling. The next row adds

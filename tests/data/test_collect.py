@@ -206,7 +206,8 @@ def test_index_says_how_much_there_is_to_see(tmp_path, no_processes):
 
 def test_scripted_policy_goes_where_the_goals_are(tmp_path, no_processes):
     options = {"horizon": 80, "image_size": 32}
-    collect(tmp_path / "data", "reacher", 800, policy=ScriptedPolicy(2, random_share=0), options=options, progress=False)
+    policy = ScriptedPolicy(2, random_share=0)
+    collect(tmp_path / "data", "reacher", 800, policy=policy, options=options, progress=False)
     dataset = EpisodeDataset.open(tmp_path / "data")
     assert dataset.metadata["policies"] == {"ScriptedPolicy": 10}
     nearest = [
@@ -221,12 +222,14 @@ def test_scripted_policy_goes_where_the_goals_are(tmp_path, no_processes):
 def test_checkpoint_as_policy(tmp_path, no_processes):
     task = make_task("reacher", **OPTIONS)
     agent = build_agent("dreamer_pcp", task, size="debug")
-    checkpoint = Checkpoint(agent=describe(agent), loss_module=agent.loss, format="archive").save(tmp_path / "checkpoint.zip")
+    state = Checkpoint(agent=describe(agent), loss_module=agent.loss, format="archive")
+    checkpoint = state.save(tmp_path / "checkpoint.zip")
     dataset = collect(tmp_path / "data", "reacher", 20, policy=checkpoint, options=OPTIONS, progress=False)
     assert dataset.metadata["policies"] == {str(checkpoint): 1}
     assert dataset.records["action"][1:].std() > 0
     other = {**OPTIONS, "virtual_target": 4}
-    with pytest.raises(ValueError, match=r"checkpoint\.zip: the agent was trained for 'reacher' with options \{.*not for"):
+    message = r"checkpoint\.zip: the agent was trained for 'reacher' with options \{.*not for"
+    with pytest.raises(ValueError, match=message):
         collect(tmp_path / "other", "reacher", 20, policy=checkpoint, options=other, progress=False)
 
 

@@ -109,16 +109,16 @@ def collect(
     def make_collector(attempt: int) -> MultiSyncCollector:
         return _make_collector(environment, options, module, workers, seed + done + attempt)
 
-    with tqdm(total=steps, initial=done, unit="step", desc=f"collect {environment}", disable=not progress) as bar:
-        with closing(_whole_episodes(make_collector)) as episodes:
-            for episode, failures in episodes:
-                records = episode_to_records(episode).select(*STORED)
-                if dataset is None:
-                    dataset = EpisodeDataset.create(path, example=records[0], metadata=source)
-                dataset.append(records, **_count(dataset, name, failures), coverage=None)
-                bar.update(len(records) - 1)
-                if dataset.num_steps >= steps:
-                    break
+    bar = tqdm(total=steps, initial=done, unit="step", desc=f"collect {environment}", disable=not progress)
+    with bar, closing(_whole_episodes(make_collector)) as episodes:
+        for episode, failures in episodes:
+            records = episode_to_records(episode).select(*STORED)
+            if dataset is None:
+                dataset = EpisodeDataset.create(path, example=records[0], metadata=source)
+            dataset.append(records, **_count(dataset, name, failures), coverage=None)
+            bar.update(len(records) - 1)
+            if dataset.num_steps >= steps:
+                break
     if dataset is None:
         raise DatasetError(f"{path}: the collector ended before the first episode was complete")
     dataset.trim()

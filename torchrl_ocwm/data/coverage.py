@@ -21,7 +21,9 @@ class Coverage(NamedTuple):
     visited: float
 
 
-def object_coverage(positions: Tensor, episode_lengths: list[int], workspace: Workspace, *, cells: int = 10) -> Coverage:
+def object_coverage(
+    positions: Tensor, episode_lengths: list[int], workspace: Workspace, *, cells: int = 10
+) -> Coverage:
     """How often an object moves and how much of the workspace it visits: nobody learns to move what never moves.
 
     Args:
@@ -50,7 +52,7 @@ def object_coverage(positions: Tensor, episode_lengths: list[int], workspace: Wo
 
 
 def dataset_coverage(dataset: EpisodeDataset, objects: tuple[str, ...], workspace: Workspace) -> dict[str, Coverage]:
-    """The coverage of each object of a dataset, from the simulator's positions, or the estimates where there are none."""
+    """Coverage of each object of a dataset, from the simulator's positions, or from estimates where there are none."""
     keys = dataset.records["next"].keys()
     positions = dataset.records["next", "object_position_true" if "object_position_true" in keys else "object_position"]
     return {

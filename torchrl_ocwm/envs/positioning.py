@@ -91,7 +91,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         self.image_size, self.horizon, self.action_repeat = image_size, horizon, action_repeat
         self.mask_scale, self.virtual_target, self.render_mode = mask_scale, virtual_target, render_mode
         self.model, self.data = self._load()
-        size = {"height": image_size, "width": image_size, "mask_scale": mask_scale}
+        size: dict[str, Any] = {"height": image_size, "width": image_size, "mask_scale": mask_scale}
         self.camera = Camera(self.model, self.camera_name, **size, **(camera_options or {}))
         self._start, self._axes = np.array(self.start), list(self.axes)
         self._geom_ids = [[self.model.geom(name).id for name in names] for names in self.objects.values()]

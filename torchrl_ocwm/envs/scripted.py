@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import TensorSpec, Unbounded
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import Transform
+
+if TYPE_CHECKING:
+    from torchrl_ocwm.envs.positioning import PositioningEnv
 
 _ARRIVED = 0.02  # metres
 
@@ -56,9 +61,8 @@ class ScriptedAction(Transform):
         return tensordict.set(self.out_keys[0], torch.from_numpy(action))
 
     @property
-    def _simulator(self):  # noqa: ANN202  (importing its class needs gymnasium and MuJoCo)
-        parent: EnvBase = self.parent
-        return parent.base_env._env.unwrapped
+    def _simulator(self) -> PositioningEnv:
+        return self.parent.base_env._env.unwrapped
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the key that is written."""

@@ -88,8 +88,7 @@ class ImaginationEnv(DreamerEnv):
         time, batch = step.ndim, [*step.batch_size, max_steps]
         states = torch.stack(latents, time)
         after = reward(TensorDict({"latent": states[..., 1:]}, batch)).select("latent", "reward")
-        actions = torch.stack(actions, time)
-        return TensorDict({"latent": states[..., :-1], "action": actions, "next": after}, batch)
+        return TensorDict({"latent": states[..., :-1], "action": torch.stack(actions, time), "next": after}, batch)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:  # noqa: ARG002
         return self.state_spec.rand() if tensordict is None else tensordict.clone()
