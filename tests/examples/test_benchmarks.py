@@ -32,7 +32,7 @@ def test_cost_of_agents_is_a_table_with_shares_that_add_up() -> None:
         [sys.executable, str(BENCHMARKS / "agent_cost.py"), *command], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert f"torch {torch.__version__}, cpu, 1 threads" in done.stdout
+    assert f"torch {torch.__version__}, cpu, float32, 1 threads" in done.stdout
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in done.stdout.splitlines() if "|" in line]
     head, _, *rows = lines
     assert [row[0] for row in rows] == agents
