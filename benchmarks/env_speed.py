@@ -5,7 +5,7 @@
 
 Both run in one process, in short turns, so that a noisy machine slows both. The minimum steps the same simulator and
 renders with ``mujoco.Renderer`` and the same flags: no shadows, no reflections, no multisampling. The next row adds
-TorchRL's wrapper, the last one steps several environments, a process each (0: no such row).
+TorchRL's wrapper. The last one is a collector with random actions, a process for each environment (0: no such row).
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ import statistics
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from functools import partial
 
 import gymnasium
 import mujoco
 import numpy as np
 import torch
-from torchrl.envs import EnvBase
+from torchrl.collectors import MultiSyncCollector
 
 from torchrl_ocwm.envs import ENVIRONMENTS, make_env
 from torchrl_ocwm.envs.positioning import PositioningEnv
@@ -55,18 +56,23 @@ def minimum(env: PositioningEnv, renderer: mujoco.Renderer, action: np.ndarray) 
     return step
 
 
-def torchrl_step(env: EnvBase, action: np.ndarray) -> Callable[[], object]:
-    """A step of TorchRL's environment, or of several in parallel."""
-    actions = torch.tensor(action, dtype=torch.float32).expand(*env.batch_size, -1)
-    tensordict = env.reset().set("action", actions)
-    return lambda: env.step(tensordict)
+def make_collector(name: str, image_size: int, workers: int, steps: int) -> MultiSyncCollector:
+    make = partial(make_env, name, image_size=image_size, horizon=10**9)
+    return MultiSyncCollector([make] * workers, None, frames_per_batch=workers * steps, total_frames=-1)
 
 
-def seconds(step: Callable[[], object], steps: int) -> float:
+def repeat(step: Callable[[], object], steps: int) -> Callable[[], None]:
+    def turn() -> None:
+        for _ in range(steps):
+            step()
+
+    return turn
+
+
+def seconds(turn: Callable[[], object]) -> float:
     start = time.perf_counter()
-    for _ in range(steps):
-        step()
-    return (time.perf_counter() - start) / steps
+    turn()
+    return time.perf_counter() - start
 
 
 def main() -> None:
@@ -85,21 +91,24 @@ def main() -> None:
         renderer = stack.enter_context(closing(make_renderer(by_hand)))
         action = np.full(env.action_space.shape, 0.3)
         several = f"{workers} processes"
+        wrapped = stack.enter_context(closing(make_env(name, image_size=size, horizon=10**9, seed=0)))
+        tensordict = wrapped.reset().set("action", torch.tensor(action, dtype=torch.float32))
         turns: dict[str, Callable[[], object]] = {
-            "minimum": minimum(by_hand, renderer, action),
-            "gymnasium environment": lambda: env.step(action),
+            "minimum": repeat(minimum(by_hand, renderer, action), arguments.steps),
+            "gymnasium environment": repeat(lambda: env.step(action), arguments.steps),
+            "TorchRL environment": repeat(lambda: wrapped.step(tensordict), arguments.steps),
         }
-        for turn, number in (("TorchRL environment", 1), (several, workers)):
-            if number:
-                made = make_env(name, num_envs=number, image_size=size, horizon=10**9, seed=0)
-                turns[turn] = torchrl_step(stack.enter_context(closing(made)), action)
-        for step in turns.values():
-            seconds(step, 20)
+        if workers:
+            collector = make_collector(name, size, workers, arguments.steps)
+            stack.callback(collector.shutdown)
+            turns[several] = partial(next, iter(collector))
+        for turn in turns.values():
+            turn()
         times: dict[str, list[float]] = {turn: [] for turn in turns}
         for _ in range(arguments.rounds):
-            for turn, step in turns.items():
-                frames = workers if turn == several else 1
-                times[turn].append(seconds(step, arguments.steps) / frames)
+            for name_of_turn, turn in turns.items():
+                frames = arguments.steps * (workers if name_of_turn == several else 1)
+                times[name_of_turn].append(seconds(turn) / frames)
 
     print(f"{name}, {size} x {size}, median of {arguments.rounds} turns of {arguments.steps} steps")
     print(f"{'':24}{'steps/s':>10}{'of the minimum':>16}")
