@@ -4,7 +4,7 @@
 # On a GPU: SIZE=paper UPDATES=250000 STEPS=1000000 DEVICE=cuda docs/results/cube_move/run.sh
 set -eu
 export MUJOCO_GL=${MUJOCO_GL:-egl} LP_NUM_THREADS=0
-size=${SIZE:-cpu} updates=${UPDATES:-5000} steps=${STEPS:-32000} device=${DEVICE:-cpu}
+size=${SIZE:-cpu} updates=${UPDATES:-8000} steps=${STEPS:-32000} device=${DEVICE:-cpu}
 here=docs/results/cube_move runs=outputs/cube_move
 python examples/collect.py env=cube_move steps=$((steps * 25 / 32)) policy=scripted dataset=data/cube_move
 python examples/collect.py env=cube_move steps="$steps" policy=random dataset=data/cube_move
@@ -12,10 +12,10 @@ python examples/collect.py env=cube_move steps="$steps" policy=random dataset=da
 train() {  # agent
   python examples/train_offline.py agent="$1" env=cube_move size="$size" dataset=data/cube_move \
     output="$runs/$1/$size/seed_0" training.updates="$updates" training.threads=1 training.device="$device" \
-    training.eval_interval=$((updates / 5))
+    training.eval_interval=$((updates / 8))
 }
-(train focus_lcp; train focus_pcp) &
-train dreamer
+(train focus_lcp; train dreamer) &
+train focus_pcp
 wait
 
 checkpoints=()
