@@ -55,9 +55,8 @@ def main() -> None:
 
     name, size, rng = arguments.env, arguments.image_size, np.random.default_rng(0)
     per_reset, resets = arguments.steps // arguments.resets, arguments.resets // PARTS
-    print(
-        f"{name}, {arguments.steps} steps, {arguments.resets} resets\n\n| after | RSS, MiB | OpenGL contexts |\n|---|---:|---:|"
-    )
+    print(f"{name}, {arguments.steps} steps, {arguments.resets} resets\n")
+    print("| after | RSS, MiB | OpenGL contexts |\n|---|---:|---:|")
     with closing(make_one(name, size)) as env:
         for part in range(PARTS):
             use(env, resets, per_reset, rng)
