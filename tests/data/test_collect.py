@@ -252,12 +252,13 @@ class FailsSometimes(InThisProcess):
         raise RuntimeError("At least one process failed")
 
 
-def test_failed_collector_is_replaced(tmp_path, monkeypatch, capsys):
+def test_failed_collector_is_replaced(tmp_path, monkeypatch):
     monkeypatch.setattr(collect_module, "MultiSyncCollector", FailsSometimes)
-    dataset = collect(tmp_path / "data", "reacher", 60, options=OPTIONS, progress=False)
+    message = r"the simulator failed \(At least one process failed\); its processes are replaced, failure 1"
+    with pytest.warns(RuntimeWarning, match=message):
+        dataset = collect(tmp_path / "data", "reacher", 60, options=OPTIONS, progress=False)
     assert dataset.episode_lengths == [21, 21, 21]
     assert dataset.metadata["failures"] == 2
-    assert "the simulator failed (At least one process failed); its processes are replaced" in capsys.readouterr().out
     actions = torch.stack([episode["action"] for episode in episodes(dataset)])
     assert len(actions.unique(dim=0)) == 3  # not the same random numbers over again
 
@@ -270,7 +271,8 @@ def test_simulator_that_fails_again_and_again(tmp_path, monkeypatch):
         raise RuntimeError("no screen")
 
     monkeypatch.setattr(collect_module, "MultiSyncCollector", fail)
-    with pytest.raises(RuntimeError, match="the simulator failed 4 times without an episode: no screen"):
+    message = "the simulator failed 4 times without an episode: no screen"
+    with pytest.warns(RuntimeWarning, match="failure 3"), pytest.raises(RuntimeError, match=message):
         collect(tmp_path / "data", "reacher", 60, options=OPTIONS, progress=False)
     assert len(tries) == 4
 
@@ -290,7 +292,8 @@ def test_killed_process_is_replaced(tmp_path, monkeypatch):
 
     monkeypatch.setattr(collect_module, "MultiSyncCollector", remember)
     monkeypatch.setattr(EpisodeDataset, "append", kill_once)
-    dataset = collect(tmp_path / "data", "reacher", 600, options=OPTIONS, progress=False)
+    with pytest.warns(RuntimeWarning, match="its processes are replaced"):
+        dataset = collect(tmp_path / "data", "reacher", 600, options=OPTIONS, progress=False)
     assert set(dataset.episode_lengths) == {21}
     assert dataset.num_steps >= 600
     assert dataset.metadata["failures"] == 1

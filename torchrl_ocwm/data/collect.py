@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections import Counter
 from collections.abc import Callable, Generator
 from contextlib import closing
@@ -188,7 +189,11 @@ def _whole_episodes(
             attempt, failures = attempt + 1, failures + 1
             if failures > MAX_FAILURES:
                 raise RuntimeError(f"the simulator failed {failures} times without an episode: {error}") from error
-            tqdm.write(f"the simulator failed ({error}); its processes are replaced, failure {attempt} of this run")
+            warnings.warn(
+                f"the simulator failed ({error}); its processes are replaced, failure {attempt} of this run",
+                RuntimeWarning,
+                stacklevel=2,
+            )
         finally:
             if collector is not None:
                 collector.shutdown(raise_on_error=False)
