@@ -25,6 +25,7 @@ from torchrl_ocwm.training.offline import CHECKPOINT
 IMAGE_GOALS = ", image goals"
 CURVES = {
     "evaluation/final_score": "final score, landmark goals",
+    "return_high": "imagined return, 95th percentile",
     "loss_model_object_position": "object position loss",
     "loss_model_pixels": "image loss",
 }
