@@ -26,6 +26,16 @@ def test_heatmap(tmp_path: Path) -> None:
     assert np.median(yellow) > np.median(blue)
 
 
+def test_heatmap_of_many_agents_has_rows(tmp_path: Path) -> None:
+    workspace = reacher_task().workspace
+    for number in (1, 7):
+        scores = {f"agent {index}": torch.zeros(9) for index in range(number)}
+        heatmap(tmp_path / f"{number}.png", scores, workspace)
+    one, seven = (imageio.imread(tmp_path / f"{number}.png") for number in (1, 7))
+    assert seven.shape[0] > 1.5 * one.shape[0]
+    assert seven.shape[1] < 6 * one.shape[1]
+
+
 def test_learning_curves(tmp_path: Path) -> None:
     for seed in (0, 1):
         logger = CSVLogger("log", log_dir=str(tmp_path / f"seed_{seed}"))
@@ -35,8 +45,11 @@ def test_learning_curves(tmp_path: Path) -> None:
     assert steps.tolist() == [10, 20]
     assert values.tolist() == [2.0, 3.0]
     runs = {"agent": [tmp_path / "seed_0", tmp_path / "seed_1"]}
-    learning_curves(tmp_path / "curves.png", runs, {"evaluation/score": "score", "missing": "nothing"})
-    assert imageio.imread(tmp_path / "curves.png").std() > 1
+    learning_curves(tmp_path / "curves.png", runs, {"evaluation/score": "score"})
+    image = imageio.imread(tmp_path / "curves.png")
+    assert image.std() > 1
+    learning_curves(tmp_path / "more.png", runs, {"evaluation/score": "score", "missing": "nothing"})
+    np.testing.assert_array_equal(imageio.imread(tmp_path / "more.png"), image)  # no panel for what nobody logged
 
 
 def test_video_is_readable(tmp_path: Path) -> None:

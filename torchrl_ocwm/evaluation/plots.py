@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from textwrap import fill
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchrl_ocwm.envs.workspace import Workspace
@@ -24,16 +27,16 @@ def heatmap(path: str | Path, scores: dict[str, Tensor], workspace: Workspace, *
         workspace: The workspace that the grid covers.
         title: Written above.
     """
-    figure, axes = plt.subplots(1, len(scores), figsize=(3.2 * len(scores) + 0.8, 3.6), squeeze=False)
-    for axis, (name, values) in zip(axes[0], scores.items(), strict=True):
+    figure, axes = _panels(len(scores), columns=5, width=3.2, height=3.4)
+    for axis, (name, values) in zip(axes, scores.items(), strict=True):
         size = round(len(values) ** 0.5)
         edges = 100 * workspace.grid_edges(size)
         x, y = edges[..., 0].numpy(), edges[..., -1].numpy()
         mesh = axis.pcolormesh(x, y, values.reshape(size, size).numpy(), vmin=0, vmax=1, cmap="viridis")
-        axis.set_title(f"{name}: {values.mean():.2f}")
+        axis.set_title(fill(f"{name}: {values.mean():.2f}", 28))
         axis.set_aspect("equal")
         axis.set_xlabel("cm")
-    figure.colorbar(mesh, ax=axes[0].tolist(), label="score", shrink=0.8)
+    figure.colorbar(mesh, ax=axes, label="score", shrink=0.8)
     if title:
         figure.suptitle(title)
     figure.savefig(path, dpi=120, bbox_inches="tight")
@@ -46,31 +49,49 @@ def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict
     Args:
         path: PNG file to write.
         runs: Name → folders of its runs, one per seed.
-        metrics: Logged name → axis label, one panel each.
+        metrics: Logged name → axis label, one panel each. What no run has logged gets no panel.
     """
-    size = (4.2 * len(metrics), 3.2)
-    figure, axes = plt.subplots(1, len(metrics), figsize=size, squeeze=False, layout="constrained")
-    for axis, (metric, label) in zip(axes[0], metrics.items(), strict=True):
-        for name, folders in runs.items():
-            found = [read_scalar(folder, metric) for folder in folders]
-            curves = [curve for curve in found if curve is not None]
-            if not curves:
-                continue
-            length = min(len(steps) for steps, _ in curves)
-            steps = curves[0][0][:length]
-            values = np.stack([values[:length] for _, values in curves])
-            (line,) = axis.plot(steps, values.mean(0), label=name)
-            if len(curves) > 1:
-                axis.fill_between(steps, values.min(0), values.max(0), alpha=0.2, color=line.get_color())
+    found = {metric: {name: _curves(folders, metric) for name, folders in runs.items()} for metric in metrics}
+    found = {metric: curves for metric, curves in found.items() if any(curves.values())}
+    figure, axes = _panels(max(len(found), 1), columns=4, width=4.2, height=3.2)
+    for axis, (metric, agents) in zip(axes, found.items(), strict=False):
+        for color, (name, curves) in enumerate(agents.items()):
+            if curves:
+                _draw_seeds(axis, curves, name, f"C{color}")
         if metric.startswith("loss_model"):
             axis.set_yscale("log")
         axis.set_xlabel("updates")
-        axis.set_ylabel(label)
+        axis.set_ylabel(metrics[metric])
         axis.grid(alpha=0.3)
-        if axis.lines:
-            axis.legend()
+        axis.legend(fontsize="small")
     figure.savefig(path, dpi=120, bbox_inches="tight")
     plt.close(figure)
+
+
+def _panels(number: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with this many panels, in rows of at most ``columns``."""
+    columns = min(number, columns)
+    rows = -(-number // columns)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(width * columns, height * rows), squeeze=False, layout="constrained"
+    )
+    for axis in axes.flat[number:]:
+        axis.remove()
+    return figure, list(axes.flat[:number])
+
+
+def _draw_seeds(axis: Axes, curves: list[tuple[np.ndarray, np.ndarray]], name: str, color: str) -> None:
+    length = min(len(steps) for steps, _ in curves)
+    steps = curves[0][0][:length]
+    values = np.stack([values[:length] for _, values in curves])
+    axis.plot(steps, values.mean(0), label=name, color=color)
+    if len(curves) > 1:
+        axis.fill_between(steps, values.min(0), values.max(0), alpha=0.2, color=color)
+
+
+def _curves(folders: list[Path], metric: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    found = (read_scalar(folder, metric) for folder in folders)
+    return [curve for curve in found if curve is not None]
 
 
 def read_scalar(folder: Path, metric: str) -> tuple[np.ndarray, np.ndarray] | None:
