@@ -1,21 +1,14 @@
 """Shelf place and Pick & place: Meta-World's physics, positions from depth, goals in the air, the scripted policy."""
 
-import importlib
-import json
-import sys
 import warnings
 
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
-import torch
-from gymnasium.utils.env_checker import check_env
 from metaworld.envs.sawyer_pick_place_v3 import SawyerPickPlaceEnvV3
 from metaworld.envs.sawyer_shelf_place_v3 import SawyerShelfPlaceEnvV3
-from torchrl.envs.utils import check_env_specs
 
-from torchrl_ocwm.envs import PickPlace, ShelfPlace, Task, make_env, make_task, registry
+from torchrl_ocwm.envs import PickPlace, ShelfPlace
 
 CLASSES = {"shelf_place": ShelfPlace, "pick_place": PickPlace}
 GOAL = np.array([0.1, 0.12], np.float32)
@@ -37,15 +30,6 @@ def env(name):
     env.close()
 
 
-@pytest.fixture(scope="module")
-def twin(name):
-    env = CLASSES[name]()
-    env.reset(seed=99)
-    env.step(np.ones(4))  # it has a past
-    yield env
-    env.close()
-
-
 @pytest.fixture
 def small(name):
     """Small images, for tests of the physics."""
@@ -56,12 +40,6 @@ def small(name):
 
 def actions(number: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, (number, 4))
-
-
-def assert_same(first, second):
-    assert first.keys() == second.keys()
-    for key in first:
-        assert np.array_equal(first[key], second[key]), key
 
 
 def pixel(name: str, point) -> tuple[float, float]:
@@ -86,47 +64,7 @@ def error(observation) -> float:
     return 1000 * float(np.linalg.norm(observation["object_position"] - observation["object_position_true"]))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("gym_id", ["ocwm/ShelfPlace-v0", "ocwm/PickPlace-v0"])
-def test_gymnasium_checker(gym_id):
-    env = gymnasium.make(gym_id, render_mode="rgb_array", image_size=16)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        check_env(env.unwrapped)
-    env.close()
-    # Positions have no bounds; that is all it may complain about.
-    assert [str(w.message) for w in caught if "infinity" not in str(w.message)] == []
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_torchrl_specs_and_horizon(name):
-    env = make_env(name, horizon=3, image_size=32, seed=1)
-    check_env_specs(env)
-    rollout = env.rollout(6)
-    env.close()
-    assert rollout["next", "masks"].shape == (3, 1, 32, 32)
-    assert rollout["action"].shape == (3, 4)
-    assert rollout["next", "truncated"].flatten().tolist() == [False, False, True]
-    assert not rollout["next", "terminated"].any()
-
-
 # The data contract.
-
-
-def test_observation_has_the_keys_shapes_and_types_of_the_contract(env):
-    observation, _ = env.reset(seed=0)
-    assert {key: (value.shape, value.dtype) for key, value in observation.items()} == {
-        "pixels": ((3, 64, 64), np.uint8),
-        "masks": ((1, 64, 64), np.bool_),
-        "proprio": ((7,), np.float32),
-        "object_position": ((1, 2), np.float32),
-        "object_visible": ((1,), np.bool_),
-        "goal_position": ((2,), np.float32),
-        "object_position_true": ((1, 2), np.float32),
-    }
-    assert env.action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
-    assert env.observation_space.contains(observation)
-    assert env.observation_space.contains(env.step(np.ones(4))[0])
 
 
 def test_proprio_and_true_position_are_the_simulators(env):
@@ -165,18 +103,6 @@ def test_images_are_upright(env, name):
     env.reset(seed=2)
     low, high = (np.nonzero(with_object_at(env, -0.2, 0.6, z)["masks"][0])[0].mean() for z in (0.02, 0.17))
     assert high < low - 5
-
-
-def test_reward_is_minus_the_distance_and_success_within_five_centimetres(env):
-    start, _ = env.reset(seed=3)
-    position = start["object_position"][0].clip(min=[-1, 0])
-    for distance, success in [(0.04, True), (0.06, False)]:
-        _, info = env.reset(seed=3, options={"goal_position": position + np.array([0, distance])})
-        assert info == {"success": success}
-        observation, reward, *_, info = env.step(STILL)
-        offset = observation["object_position"][0] - observation["goal_position"]
-        assert reward == pytest.approx(-np.hypot(*offset), abs=1e-6)
-        assert info == {"success": success}
 
 
 def test_nothing_of_meta_worlds_own_marks_in_the_picture(env):
@@ -251,40 +177,6 @@ def test_episodes_are_longer_than_meta_worlds(small):
         assert truncated == (step >= 250)
 
 
-def test_actions_are_clipped(env, twin):
-    env.reset(seed=8)
-    twin.reset(seed=8)
-    first, second = env.step(np.array([3.0, -7.0, 1.5, -2.0])), twin.step(np.array([1.0, -1.0, 1.0, -1.0]))
-    assert_same(first[0], second[0])
-
-
-def test_same_seed_same_everything(env, twin):
-    assert_same(env.reset(seed=9)[0], twin.reset(seed=9)[0])
-    for action in actions(8):
-        first, second = env.step(action), twin.step(action)
-        assert_same(first[0], second[0])
-        assert first[1:] == second[1:]
-    assert_same(env.reset()[0], twin.reset()[0])
-
-
-def test_other_seed_other_start(env, twin):
-    first, second = env.reset(seed=10)[0], twin.reset(seed=11)[0]
-    for key in ("pixels", "goal_position", "object_position_true"):
-        assert not np.array_equal(first[key], second[key])
-
-
-def test_given_goal(env):
-    drawn, _ = env.reset(seed=5)
-    given, _ = env.reset(seed=5, options={"goal_position": GOAL})
-    assert np.array_equal(given["goal_position"], GOAL)
-    assert np.array_equal(env.step(STILL)[0]["goal_position"], GOAL)
-    assert not np.array_equal(drawn.pop("goal_position"), given.pop("goal_position"))
-    assert_same(drawn, given)
-    for outside in [(0.0, -0.01), (0.4, 0.1)]:
-        with pytest.raises(ValueError, match="lies outside the workspace"):
-            env.reset(options={"goal_position": outside})
-
-
 # Positions from masks.
 
 
@@ -300,24 +192,6 @@ def test_position_error_over_random_places(env):
     assert len(errors) > 40  # the hand hides some places above the start
     assert np.median(errors) < 3.5
     assert np.percentile(errors, 95) < 15
-
-
-def test_hidden_object_keeps_its_last_position(env):
-    env.reset(seed=14, options={"goal_position": GOAL})
-    seen, *_ = env.step(STILL)
-    geom = env.model.geom("objGeom").id
-    try:
-        env.model.geom_rgba[geom, 3] = 0
-        env.data.qpos[9] += 0.05
-        hidden, reward, *_ = env.step(STILL)
-    finally:
-        env.model.geom_rgba[geom, 3] = 1
-    assert hidden["object_visible"].tolist() == [False]
-    assert np.array_equal(hidden["object_position"], seen["object_position"])
-    assert reward == pytest.approx(-np.linalg.norm(seen["object_position"][0] - GOAL), abs=1e-6)
-    again, *_ = env.step(STILL)
-    assert again["object_visible"].tolist() == [True]
-    assert error(again) < 8
 
 
 def test_virtual_target(env, name):
@@ -354,31 +228,6 @@ def test_goal_observation_shows_the_object_held_at_the_goal(env):
         assert hand == pytest.approx([goal[0], 0, goal[1] + 0.036], abs=0.01)  # around the object, from above
         assert opening < 0.06
         assert not velocity.any()
-
-
-def test_goal_observation_does_not_depend_on_the_episode(env):
-    env.reset(seed=18)
-    first = env.goal_observation(GOAL)
-    for _ in range(5):
-        env.step(np.array([-1.0, 0.5, 0.3, 1.0]))
-    assert_same(first, env.goal_observation(GOAL))
-
-
-def test_goal_observation_leaves_the_episode_alone(env, twin):
-    env.reset(seed=19)
-    twin.reset(seed=19)
-    full = mujoco.mjtState.mjSTATE_INTEGRATION
-    before, after = np.empty((2, mujoco.mj_stateSize(env.model, full)))
-    for action in actions(6, seed=1):
-        mujoco.mj_getState(env.model, env.data, before, full)
-        for goal in [(0.2, 0.0), (-0.1, 0.1)]:
-            env.goal_observation(goal)
-        mujoco.mj_getState(env.model, env.data, after, full)
-        assert np.array_equal(before, after)
-        first, second = env.step(action), twin.step(action)
-        assert_same(first[0], second[0])
-        assert first[1:] == second[1:]
-    assert_same(env.reset()[0], twin.reset()[0])
 
 
 # The scripted policy.
@@ -421,25 +270,3 @@ def test_positions_while_the_arm_carries_the_object(env):
         errors.append(error(observation))
     assert np.median(errors) < 8
     assert max(errors) < 15
-
-
-# Names and resources.
-
-
-def test_task_describes_the_environment_also_through_json(name):
-    task = make_task(name, image_size=16, horizon=9)
-    assert (task.objects, task.proprio, task.action, task.image_size) == (("object",), 7, 4, 16)
-    assert task.workspace == CLASSES[name].workspace
-    assert task.workspace.contains(torch.tensor(task.workspace.landmarks)).all()
-    assert len(set(task.workspace.landmarks)) == 10
-    assert Task.from_dict(json.loads(json.dumps(task.to_dict()))) == task
-
-
-def test_missing_meta_world_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(registry, "find_spec", lambda name: None if name == "metaworld" else True)
-    with pytest.raises(ModuleNotFoundError, match=r"'pick_place' needs metaworld.*'torchrl-ocwm\[metaworld\]'"):
-        make_env("pick_place")
-    monkeypatch.delitem(sys.modules, "torchrl_ocwm.envs.meta_world")
-    monkeypatch.setitem(sys.modules, "metaworld.envs.sawyer_pick_place_v3", None)
-    with pytest.raises(ModuleNotFoundError, match=r"need metaworld.*'torchrl-ocwm\[metaworld\]'"):
-        importlib.import_module("torchrl_ocwm.envs.meta_world")

@@ -1,0 +1,339 @@
+"""What all environments promise alike: the data contract, goals, seeds, hidden objects, goal observations."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_ocwm.envs import ENVIRONMENTS, Task, make_env, make_task, registry
+from torchrl_ocwm.envs.positioning import Observation, PositioningEnv
+
+
+class Case(NamedTuple):
+    proprio: int
+    actions: int
+    objects: tuple[str, ...]
+    geom: str  # what is seen of the first object
+    package: str
+    extra: str
+
+
+CASES = {
+    "reacher": Case(5, 2, ("finger",), "finger", "dm_control", "dm-control"),
+    "cube_move": Case(19, 4, ("cube",), "cube_g0_vis", "robosuite", "robosuite"),
+    "shelf_place": Case(7, 4, ("object",), "objGeom", "metaworld", "metaworld"),
+    "pick_place": Case(7, 4, ("object",), "objGeom", "metaworld", "metaworld"),
+}
+GOAL = np.array([0.1, 0.12], np.float32)  # in all workspaces
+
+
+def test_every_environment_is_here() -> None:
+    assert list(CASES) == list(ENVIRONMENTS)
+
+
+@pytest.fixture(scope="module", params=CASES)
+def name(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def case(name: str) -> Case:
+    return CASES[name]
+
+
+@pytest.fixture(scope="module")
+def env(name: str) -> Iterator[PositioningEnv]:
+    env = gymnasium.make(ENVIRONMENTS[name].id).unwrapped
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def twin(name: str) -> Iterator[PositioningEnv]:
+    env = gymnasium.make(ENVIRONMENTS[name].id).unwrapped
+    env.reset(seed=99)
+    env.step(np.ones(env.action_space.shape))  # it has a past
+    yield env
+    env.close()
+
+
+@pytest.fixture
+def hide(env: PositioningEnv, case: Case) -> Iterator[Callable[..., None]]:
+    """Make the object invisible, and visible again after the test."""
+    geom = env.model.geom(case.geom).id
+    alpha = env.model.geom_rgba[geom, 3]
+
+    def hide(hidden: bool = True) -> None:
+        env.model.geom_rgba[geom, 3] = 0 if hidden else alpha
+
+    yield hide
+    hide(False)
+
+
+def still(env: PositioningEnv) -> np.ndarray:
+    """An action that moves nothing: no torque or displacement, an open gripper."""
+    action = np.zeros(env.action_space.shape)
+    if len(action) == 4:
+        action[3] = -1
+    return action
+
+
+def actions(env: PositioningEnv, number: int) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-1, 1, (number, *env.action_space.shape))
+
+
+def assert_same(first: Observation, second: Observation) -> None:
+    assert first.keys() == second.keys()
+    for key in first:
+        assert np.array_equal(first[key], second[key]), key
+
+
+def error(observation: Observation) -> float:
+    """Distance between estimated and true position, millimetres."""
+    return 1000 * float(np.linalg.norm(observation["object_position"] - observation["object_position_true"]))
+
+
+def state(env: PositioningEnv) -> np.ndarray:
+    """All that the physics go on from."""
+    full = mujoco.mjtState.mjSTATE_INTEGRATION
+    values = np.empty(mujoco.mj_stateSize(env.model, full))
+    mujoco.mj_getState(env.model, env.data, values, full)
+    return values
+
+
+@pytest.mark.slow
+def test_gymnasium_checker(name: str) -> None:
+    env = gymnasium.make(ENVIRONMENTS[name].id, render_mode="rgb_array", image_size=16)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped)
+    env.close()
+    # Positions have no bounds; that is all it may complain about.
+    assert [str(w.message) for w in caught if "infinity" not in str(w.message)] == []
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_torchrl_specs_and_horizon(name: str, case: Case) -> None:
+    env = make_env(name, horizon=3, image_size=16, seed=1)
+    check_env_specs(env)
+    rollout = env.rollout(7, break_when_any_done=False)
+    env.close()
+    assert rollout["next", "masks"].shape == (7, 1, 16, 16)
+    assert rollout["action"].shape == (7, case.actions)
+    assert rollout["next", "truncated"].flatten().nonzero().flatten().tolist() == [2, 5]
+    assert not rollout["next", "terminated"].any()
+    assert rollout["next", "proprio"].isfinite().all()
+
+
+# The data contract.
+
+
+def test_observation_has_the_keys_shapes_and_types_of_the_contract(env: PositioningEnv, case: Case) -> None:
+    observation, _ = env.reset(seed=0)
+    assert {key: (value.shape, value.dtype) for key, value in observation.items()} == {
+        "pixels": ((3, 64, 64), np.uint8),
+        "masks": ((1, 64, 64), np.bool_),
+        "proprio": ((case.proprio,), np.float32),
+        "object_position": ((1, 2), np.float32),
+        "object_visible": ((1,), np.bool_),
+        "goal_position": ((2,), np.float32),
+        "object_position_true": ((1, 2), np.float32),
+    }
+    assert env.action_space == gymnasium.spaces.Box(-1, 1, (case.actions,), np.float32)
+    assert env.observation_space.contains(observation)
+    assert env.observation_space.contains(env.step(np.ones(case.actions))[0])
+
+
+def test_reward_is_minus_the_distance_in_metres(env: PositioningEnv) -> None:
+    env.reset(seed=2, options={"goal_position": GOAL})
+    for action in actions(env, 5):
+        observation, reward, *_ = env.step(action)
+        x, y = (float(value) for value in observation["object_position"][0])
+        assert reward == pytest.approx(-np.hypot(x - 0.1, y - 0.12), abs=1e-6)
+
+
+@pytest.mark.parametrize(("distance", "success"), [(0.0, True), (0.045, True), (0.055, False), (0.1, False)])
+def test_success_within_five_centimetres(env: PositioningEnv, distance: float, success: bool) -> None:
+    low, high = np.array(env.workspace.low), np.array(env.workspace.high)
+    start, _ = env.reset(seed=3)
+    position = start["object_position"][0].clip(low, high)
+    inwards = (low + high) / 2 - position
+    goal = position + distance * inwards / np.linalg.norm(inwards)
+    _, info = env.reset(seed=3, options={"goal_position": goal})
+    assert info == {"success": success}
+    _, reward, *_, info = env.step(still(env))  # the cube settles a few millimetres
+    assert info == {"success": reward >= -0.05}
+
+
+# Goals.
+
+
+def test_given_goal(env: PositioningEnv) -> None:
+    observation, _ = env.reset(options={"goal_position": GOAL})
+    assert np.array_equal(observation["goal_position"], GOAL)
+    assert np.array_equal(env.step(still(env))[0]["goal_position"], GOAL)
+    drawn, _ = env.reset()
+    assert not np.array_equal(drawn["goal_position"], GOAL)
+
+
+def test_given_goal_does_not_change_the_start(env: PositioningEnv) -> None:
+    drawn, _ = env.reset(seed=5)
+    following, _ = env.reset()
+    given, _ = env.reset(seed=5, options={"goal_position": GOAL})
+    following_given, _ = env.reset()
+    assert not np.array_equal(drawn.pop("goal_position"), given.pop("goal_position"))
+    assert_same(drawn, given)
+    assert_same(following, following_given)
+
+
+@pytest.mark.parametrize("goal", [(0.5, 0.1), (0.1, -0.5)])
+def test_goals_outside_the_workspace(env: PositioningEnv, goal: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="lies outside the workspace"):
+        env.reset(options={"goal_position": goal})
+    with pytest.raises(ValueError, match="lies outside the workspace"):
+        env.goal_observation(goal)
+
+
+# Actions and seeds.
+
+
+def test_actions_are_clipped(env: PositioningEnv, twin: PositioningEnv) -> None:
+    env.reset(seed=8)
+    twin.reset(seed=8)
+    size = len(still(env))
+    first, second = (
+        env.step(np.array([3.0, -7.0, 1.5, -2.0])[:size]),
+        twin.step(np.array([1.0, -1.0, 1.0, -1.0])[:size]),
+    )
+    assert_same(first[0], second[0])
+
+
+def test_same_seed_same_everything(env: PositioningEnv, twin: PositioningEnv) -> None:
+    assert_same(env.reset(seed=9)[0], twin.reset(seed=9)[0])
+    for action in actions(env, 8):
+        first, second = env.step(action), twin.step(action)
+        assert_same(first[0], second[0])
+        assert first[1:] == second[1:]
+    assert_same(env.reset()[0], twin.reset()[0])
+
+
+def test_other_seed_other_start(env: PositioningEnv, twin: PositioningEnv) -> None:
+    first, second = env.reset(seed=10)[0], twin.reset(seed=11)[0]
+    for key in ("pixels", "goal_position", "object_position_true"):
+        assert not np.array_equal(first[key], second[key])
+
+
+def test_closing_frees_the_camera_and_leaves_others_alone(env: PositioningEnv, name: str) -> None:
+    before, _ = env.reset(seed=12)
+    other = gymnasium.make(ENVIRONMENTS[name].id, image_size=16).unwrapped
+    other.reset(seed=13)
+    env.reset(seed=14)
+    other.close()
+    other.close()
+    with pytest.raises(RuntimeError, match="this camera is closed"):
+        other.reset()
+    assert_same(env.reset(seed=12)[0], before)
+
+
+# Hidden objects.
+
+
+def test_hidden_object_keeps_its_last_position(env: PositioningEnv, hide: Callable[..., None]) -> None:
+    env.reset(seed=14, options={"goal_position": GOAL})
+    seen, *_ = env.step(still(env))
+    hide()
+    env._teleport(env.data, env._check_goal(GOAL))
+    for _ in range(2):
+        hidden, reward, *_ = env.step(still(env))
+        assert hidden["object_visible"].tolist() == [False]
+        assert not hidden["masks"].any()
+        assert np.array_equal(hidden["object_position"], seen["object_position"])
+        assert error(hidden) > 20
+        assert reward == pytest.approx(-np.linalg.norm(seen["object_position"][0] - GOAL), abs=1e-6)
+    hide(False)
+    again, *_ = env.step(still(env))
+    assert again["object_visible"].tolist() == [True]
+    assert error(again) < 12
+
+
+def test_hidden_from_the_start_is_zero(env: PositioningEnv, hide: Callable[..., None]) -> None:
+    env.reset(seed=15)
+    env.step(still(env))
+    hide()
+    observation, _ = env.reset(seed=16)
+    assert observation["object_visible"].tolist() == [False]
+    assert observation["object_position"].tolist() == [[0.0, 0.0]]
+
+
+# Goal observations.
+
+
+def test_goal_observation_shows_the_object_at_the_goal(env: PositioningEnv) -> None:
+    env.reset(seed=18)
+    for goal in env.workspace.grid(3).flatten(0, 1).numpy():
+        observation = env.goal_observation(goal)
+        assert env.observation_space.contains(observation)
+        assert observation["object_position_true"][0] == pytest.approx(goal, abs=1e-6)
+        assert observation["goal_position"] == pytest.approx(goal)
+        assert observation["object_visible"].tolist() == [True]
+        assert error(observation) < 12
+
+
+def test_goal_observation_does_not_depend_on_the_episode(env: PositioningEnv) -> None:
+    env.reset(seed=18)
+    first = env.goal_observation(GOAL)
+    for action in actions(env, 5):
+        env.step(action)
+    assert_same(first, env.goal_observation(GOAL))
+
+
+def test_goal_observation_leaves_the_episode_alone(env: PositioningEnv, twin: PositioningEnv) -> None:
+    env.reset(seed=19)
+    twin.reset(seed=19)
+    for action in actions(env, 6):
+        before = state(env)
+        for goal in [(0.15, 0.05), (-0.1, 0.1)]:
+            env.goal_observation(np.array(goal))
+        assert np.array_equal(state(env), before)
+        first, second = env.step(action), twin.step(action)
+        assert_same(first[0], second[0])
+        assert first[1:] == second[1:]
+    assert_same(env.reset()[0], twin.reset()[0])
+
+
+# Names.
+
+
+def test_task_describes_the_environment_also_through_json(env: PositioningEnv, name: str, case: Case) -> None:
+    task = make_task(name, image_size=16, horizon=9)
+    assert (task.objects, task.proprio, task.action, task.image_size) == (case.objects, case.proprio, case.actions, 16)
+    assert task.workspace == env.workspace
+    assert task.workspace.contains(torch.tensor(task.workspace.landmarks)).all()
+    assert len(set(task.workspace.landmarks)) == 10
+    assert Task.from_dict(json.loads(json.dumps(task.to_dict()))) == task
+
+
+def test_missing_simulator_says_what_to_install(monkeypatch: pytest.MonkeyPatch, name: str, case: Case) -> None:
+    what = rf"needs? {case.package}.*'torchrl-ocwm\[{case.extra}\]'"
+    with monkeypatch.context() as patch:
+        patch.setattr(registry, "find_spec", lambda module: None if module == case.package else True)
+        with pytest.raises(ModuleNotFoundError, match=f"'{name}' {what}"):
+            make_env(name)
+    module = ENVIRONMENTS[name].entry_point.split(":")[0]
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    for loaded in [loaded for loaded in sys.modules if loaded.split(".")[0] == case.package]:
+        monkeypatch.setitem(sys.modules, loaded, None)
+    with pytest.raises(ModuleNotFoundError, match=what):
+        importlib.import_module(module)
