@@ -252,6 +252,7 @@ def test_closing_frees_the_camera_and_leaves_others_alone(env: PositioningEnv, n
 
 def test_hidden_object_keeps_its_last_position(env: PositioningEnv, hide: Callable[..., None]) -> None:
     env.reset(seed=14, options={"goal_position": GOAL})
+    env._teleport(env.data, np.array([-0.1, 0.1]))
     seen, *_ = env.step(still(env))
     hide()
     env._teleport(env.data, env._check_goal(GOAL))
