@@ -10,15 +10,24 @@ from pathlib import Path
 import gymnasium
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm import load_agent
 from torchrl_ocwm.agents import Policy, agent_name
 from torchrl_ocwm.data import SmoothRandomPolicy
 from torchrl_ocwm.envs import ENVIRONMENTS, Task
-from torchrl_ocwm.evaluation import EvaluationEnvs, ReconstructionError, Report, goal_images, measure
+from torchrl_ocwm.evaluation import (
+    EvaluationEnvs,
+    ReconstructionError,
+    Report,
+    goal_images,
+    imagined_distance,
+    imagined_rollout,
+    measure,
+)
 from torchrl_ocwm.evaluation.plots import heatmap, learning_curves
-from torchrl_ocwm.evaluation.videos import imagined_rollout, mark, tile, write_video
+from torchrl_ocwm.evaluation.videos import decode_video, mark, tile, write_video
 from torchrl_ocwm.training.config import recipe
 from torchrl_ocwm.training.offline import CHECKPOINT
 
@@ -87,9 +96,17 @@ def _folders(sources: list[str]) -> list[Path]:
 def _evaluate(
     policy: Policy, envs: EvaluationEnvs, goals: Tensor, seed: int, images: Tensor | None = None
 ) -> dict[str, Tensor]:
-    inspect = ReconstructionError(policy.agent)
+    reconstruct = ReconstructionError(policy.agent)
+
+    def inspect(step: TensorDictBase) -> dict[str, Tensor | TensorDictBase]:
+        return {**reconstruct(step), "latent": step["latent"].select("state", "belief", "goal", strict=False)}
+
     episodes = envs.run(policy, goals, images=images, seed=seed, inspect=inspect, progress=True)
     errors = {name: episodes[name].mean(1) for name in ("entity_error", "goal_error") if name in episodes}
+    if "object_position" in policy.agent.config.observed:
+        errors["imagined_distance"] = imagined_distance(
+            policy.agent, episodes["latent"][:, 0], goals, envs.episode_steps
+        )
     return {**measure(episodes), **errors}
 
 
@@ -100,7 +117,8 @@ def _film(policy: Policy, envs: EvaluationEnvs, goals: Tensor, file: Path, image
     """
     task = policy.agent.task
     episodes = envs.run(policy, goals, images=images, keep=("pixels",), inspect=lambda step: {"latent": step["latent"]})
-    imagined = imagined_rollout(policy.agent, episodes["latent"][:, 0], envs.episode_steps)
+    latents = imagined_rollout(policy.agent, episodes["latent"][:, 0], envs.episode_steps)["latent"]
+    imagined = decode_video(policy.agent.model, latents)
     with gymnasium.make(ENVIRONMENTS[task.name].id, **task.options) as env:
         points = torch.as_tensor(env.unwrapped.project(goals.numpy()))
     rows = [mark(episodes["pixels"], points), mark(imagined, points)]

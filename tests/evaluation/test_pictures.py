@@ -9,8 +9,9 @@ import pytest
 import torch
 from torchrl.record.loggers import CSVLogger
 
+from torchrl_ocwm.evaluation.imagined import imagined_rollout
 from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, read_scalar
-from torchrl_ocwm.evaluation.videos import OpenLoopFilm, imagined_rollout, mark, open_loop_prediction, tile, write_video
+from torchrl_ocwm.evaluation.videos import OpenLoopFilm, decode_video, mark, open_loop_prediction, tile, write_video
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
 
 
@@ -95,7 +96,7 @@ def test_open_loop_sees_the_context_only(make_agent: Any) -> None:
     assert not changed[:5].any()
 
 
-def test_film_and_imagined_rollout(make_agent: Any, tmp_path: Path) -> None:
+def test_film_and_imagined_video(make_agent: Any, tmp_path: Path) -> None:
     agent = make_agent()
     film = OpenLoopFilm(
         agent, random_dataset(tmp_path / "data", agent.task), tmp_path / "videos", sequences=2, context=2
@@ -104,4 +105,5 @@ def test_film_and_imagined_rollout(make_agent: Any, tmp_path: Path) -> None:
     assert file == tmp_path / "videos" / "open_loop_0000100.mp4"
     assert len(imageio.imread(file, plugin="FFMPEG", index=None)) == 20
     start = agent.imagination.reset().expand(3).clone()["latent"]
-    assert imagined_rollout(agent, start, 4).shape == (3, 4, 3, 64, 64)
+    latents = imagined_rollout(agent, start, 4)["latent"]
+    assert decode_video(agent.model, latents).shape == (3, 4, 3, 64, 64)

@@ -4,6 +4,7 @@ Needs the extra ``recipes``; ``plots`` and ``videos`` are imported from their mo
 """
 
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, goal_images, measure
+from torchrl_ocwm.evaluation.imagined import imagined_distance, imagined_rollout
 from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation
 from torchrl_ocwm.evaluation.reconstruction import ReconstructionError
 from torchrl_ocwm.evaluation.report import Report
@@ -15,6 +16,8 @@ __all__ = [
     "ReconstructionError",
     "Report",
     "goal_images",
+    "imagined_distance",
+    "imagined_rollout",
     "mean_and_error",
     "measure",
     "normalized_score",

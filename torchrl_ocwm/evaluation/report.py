@@ -19,6 +19,7 @@ COLUMNS = {
     "mean_score": ("mean score", 2),
     "success": ("success within 5 cm", 2),
     "final_distance": ("final distance, m", 3),
+    "imagined_distance": ("final distance as imagined, m", 3),
     "entity_error": ("entity reconstruction error, m", 3),
     "goal_error": ("goal reconstruction error, m", 3),
 }

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import imageio.v3 as imageio
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm.agents.agent import Agent
@@ -64,10 +63,12 @@ def open_loop_prediction(model: WorldModel, records: TensorDictBase, context: in
     Returns:
         ``[N, T, 3, H, W]`` uint8: reconstructions of the context, then predictions.
     """
-    return _images(model, open_loop_latents(model, records, context))
+    return decode_video(model, open_loop_latents(model, records, context))
 
 
-def _images(model: WorldModel, latents: TensorDictBase) -> Tensor:
+@torch.no_grad()
+def decode_video(model: WorldModel, latents: TensorDictBase) -> Tensor:
+    """Videos ``[N, T, 3, H, W]`` uint8 of latents ``[N, T]`` with state and belief, step by step to save memory."""
     return torch.stack([to_uint8(decode_pixels(model, step)) for step in latents.unbind(1)], 1)
 
 
@@ -128,7 +129,7 @@ class OpenLoopFilm:
     def __call__(self, updates: int) -> Path:
         model, device = self.agent.model, next(self.agent.parameters()).device
         latents = open_loop_latents(model, self.records.to(device), self.context)
-        truth, predicted = self.records["next", "pixels"], _images(model, latents).cpu()
+        truth, predicted = self.records["next", "pixels"], decode_video(model, latents).cpu()
         masks: tuple[Tensor, ...] = ()
         if isinstance(model, ObjectWorldModel):
             masks = grey(decode_objects(model, latents)[1][:, :, :-1]).cpu().unbind(2)
@@ -136,25 +137,6 @@ class OpenLoopFilm:
         file = self.folder / f"open_loop_{updates:07d}.mp4"
         write_video(file, tile([truth, predicted, *masks, error]))
         return file
-
-
-@torch.no_grad()
-def imagined_rollout(agent: Agent, latent: TensorDictBase, steps: int) -> Tensor:
-    """What an agent imagines from a latent when it acts on its own predictions.
-
-    Args:
-        agent: The agent.
-        latent: ``[N]`` with state, belief and, if the agent is conditioned on one, goal.
-        steps: Steps to imagine.
-
-    Returns:
-        ``[N, steps, 3, H, W]`` uint8.
-    """
-    latent = latent.select("state", "belief", "goal", strict=False)
-    start = TensorDict({"latent": latent}, latent.batch_size)
-    actor: Callable[[TensorDictBase], TensorDictBase] = agent.actor
-    rollout = agent.imagination.rollout(steps, actor, auto_reset=False, tensordict=start, break_when_any_done=False)
-    return to_uint8(decode_pixels(agent.model, rollout["latent"]))
 
 
 def mark(pixels: Tensor, points: Tensor) -> Tensor:

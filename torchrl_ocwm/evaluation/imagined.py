@@ -1,0 +1,57 @@
+"""What an agent believes that it will do: rollouts of the policy in its own world model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_ocwm.agents.agent import Agent
+
+
+@torch.no_grad()
+def imagined_rollout(agent: Agent, latent: TensorDictBase, steps: int) -> TensorDictBase:
+    """What an agent imagines from a latent when it acts on its own predictions, without exploration.
+
+    Args:
+        agent: The agent.
+        latent: ``[N]`` with state, belief and, if the agent is conditioned on one, goal.
+        steps: Steps to imagine.
+
+    Returns:
+        ``[N, steps]`` with ``latent`` and ``action``; the first latent is the given one.
+    """
+    latent = latent.select("state", "belief", "goal", strict=False)
+    start = TensorDict({"latent": latent}, latent.batch_size)
+    actor: Callable[[TensorDictBase], TensorDictBase] = agent.actor
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        return agent.imagination.rollout(
+            steps, actor, auto_reset=False, tensordict=start, break_when_any_done=False
+        ).select("latent", "action")
+
+
+@torch.no_grad()
+def imagined_distance(
+    agent: Agent, latent: TensorDictBase, goals: Tensor, steps: int, *, object_index: int = 0
+) -> Tensor:
+    """How far from its goal an agent expects the object to be in the end.
+
+    Where this is small and the real distance large, the policy exploits errors of the world model; where both are
+    large, the policy has not learned what the model would let it do.
+
+    Args:
+        agent: The agent.
+        latent: ``[N]``, as for :func:`imagined_rollout`.
+        goals: ``[N, D]`` metres.
+        steps: Steps to imagine.
+        object_index: Which object.
+
+    Returns:
+        ``[N]`` metres, of the position that the world model decodes from the last latent.
+    """
+    last = imagined_rollout(agent, latent, steps + 1)[:, -1].select("latent")
+    decoded = agent.model.object_position()(last)["object_units"].unflatten(-1, (-1, agent.model.units.dim))
+    return torch.linalg.vector_norm(agent.model.units.to_metres(decoded[:, object_index]) - goals, dim=-1)
