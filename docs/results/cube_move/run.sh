@@ -1,33 +1,57 @@
 #!/usr/bin/env bash
-# What docs/results/cube_move shows: three agents on the same data, the same number of updates.
+# What docs/results/cube_move shows: three agents on scripted and random data, then two of them go on with data of their own.
 # One thread each, two runs at a time. Run from the repository root; what is done already is not done again.
 # On a GPU: SIZE=paper UPDATES=250000 STEPS=1000000 GOALS=100 DEVICE=cuda docs/results/cube_move/run.sh
 set -eu
 export MUJOCO_GL=${MUJOCO_GL:-egl} LP_NUM_THREADS=0
 size=${SIZE:-cpu} updates=${UPDATES:-4000} steps=${STEPS:-32000} device=${DEVICE:-cpu}
-here=docs/results/cube_move runs=outputs/cube_move
-python examples/collect.py env=cube_move steps=$((steps * 25 / 32)) policy=scripted dataset=data/cube_move
-python examples/collect.py env=cube_move steps="$steps" policy=random dataset=data/cube_move
+here=docs/results/cube_move first=outputs/cube_move own=outputs/cube_move_own
 
-train() {  # agent
-  python examples/train_offline.py agent="$1" env=cube_move size="$size" dataset=data/cube_move \
-    output="$runs/$1/$size/seed_0" training.updates="$updates" training.threads=1 training.device="$device" \
-    training.eval_interval=$((updates / 8)) training.eval_episodes=5
+collect() {  # policy, steps, dataset
+  python examples/collect.py env=cube_move policy="$1" steps="$2" dataset="$3"
 }
-(train focus_lcp; train dreamer) &
-train focus_pcp
-wait
+train() {  # agent, runs, dataset, updates
+  python examples/train_offline.py agent="$1" env=cube_move size="$size" dataset="$3" output="$2/$1/$size/seed_0" \
+    training.updates="$4" training.eval_interval=$((updates / 8)) training.eval_episodes=5 \
+    training.threads=1 training.device="$device"
+}
+evaluate() {  # folder, runs, agents...
+  local folder=$1 runs=$2 checkpoints=""
+  shift 2
+  mkdir -p "$folder"
+  : > "$folder/wall_time.txt"
+  for agent in "$@"; do
+    local run=$runs/$agent/$size/seed_0 name=${agent}_seed_0
+    checkpoints+=,$run/checkpoint.zip
+    cp "$run/.hydra/config.yaml" "$folder/$name.yaml"
+    cp "$run/log/scalars/evaluation/final_score.csv" "$folder/$name.csv"
+    echo "$name $(($(stat -c %Y "$run/checkpoint.zip") - $(stat -c %Y "$run/.hydra/config.yaml"))) s" >> "$folder/wall_time.txt"
+  done
+  python examples/evaluate.py goals=${GOALS:-36} image_goals=true episode_steps=100 output="$folder" \
+    "checkpoint=[${checkpoints#,}]"
+}
 
-checkpoints=()
-: > "$here/wall_time.txt"
-for agent in dreamer focus_pcp focus_lcp; do
-  run=$runs/$agent/$size/seed_0 name=${agent}_seed_0
-  checkpoints+=("$run/checkpoint.zip")
-  cp "$run/.hydra/config.yaml" "$here/$name.yaml"
-  cp "$run/log/scalars/evaluation/final_score.csv" "$here/$name.csv"
-  echo "$name $(($(stat -c %Y "$run/checkpoint.zip") - $(stat -c %Y "$run/.hydra/config.yaml"))) s" >> "$here/wall_time.txt"
-done
-python examples/evaluate.py goals=${GOALS:-36} image_goals=true episode_steps=100 output=$here \
-  "checkpoint=[$(IFS=,; echo "${checkpoints[*]}")]"
-python examples/diagnose.py checkpoint="$runs/focus_lcp/$size/seed_0/checkpoint.zip" dataset=data/cube_move \
+collect scripted $((steps * 25 / 32)) data/cube_move
+collect random "$steps" data/cube_move
+(train focus_lcp $first data/cube_move "$updates"; train dreamer $first data/cube_move "$updates") &
+train focus_pcp $first data/cube_move "$updates"
+wait
+evaluate $here $first dreamer focus_pcp focus_lcp
+
+# The second round: what the agents do themselves, added to the data.
+if [ ! -d $own ]; then
+  cp -r data/cube_move data/cube_move_own
+  for agent in focus_pcp focus_lcp; do
+    mkdir -p "$own/$agent"
+    cp -r "$first/$agent/$size" "$own/$agent/"
+  done
+fi
+more=$((steps * 6 / 32))
+collect $first/focus_pcp/"$size"/seed_0/checkpoint.zip $((steps + more)) data/cube_move_own
+collect $first/focus_lcp/"$size"/seed_0/checkpoint.zip $((steps + 2 * more)) data/cube_move_own
+train focus_lcp $own data/cube_move_own $((updates * 7 / 4)) &
+train focus_pcp $own data/cube_move_own $((updates * 7 / 4))
+wait
+evaluate $here/own_data $own focus_pcp focus_lcp
+python examples/diagnose.py checkpoint="$own/focus_lcp/$size/seed_0/checkpoint.zip" dataset=data/cube_move_own \
   output=$here/diagnosis
