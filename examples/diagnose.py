@@ -20,13 +20,7 @@ from torchrl_ocwm.agents import Agent
 from torchrl_ocwm.data import EpisodeDataset
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
-from torchrl_ocwm.evaluation.object_pictures import (
-    draw_errors,
-    draw_goal_latents,
-    draw_objects,
-    film_objects,
-    object_rows,
-)
+from torchrl_ocwm.evaluation.object_pictures import draw_errors, draw_goal_latents, picture_objects
 from torchrl_ocwm.evaluation.objects import object_errors
 from torchrl_ocwm.evaluation.open_loop import random_sequences
 from torchrl_ocwm.modules import ObjectWorldModel
@@ -79,9 +73,7 @@ def _errors(agent: Agent, records: TensorDictBase, config: DictConfig, output: P
     if errors["imagined"]:
         draw_errors(output / "errors.png", errors, names)
     if isinstance(model, ObjectWorldModel) and config.video_sequences:
-        rows = object_rows(model, records[: config.video_sequences], config.context, names)
-        film_objects(output / "objects.mp4", rows)
-        draw_objects(output / "objects.png", rows, config.context)
+        picture_objects(output, model, records[: config.video_sequences], config.context, names)
     return errors
 
 

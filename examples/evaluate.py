@@ -14,23 +14,29 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm import load_agent
-from torchrl_ocwm.agents import Policy, agent_name
+from torchrl_ocwm.agents import Agent, Policy, agent_name
 from torchrl_ocwm.data import SmoothRandomPolicy
 from torchrl_ocwm.envs import ENVIRONMENTS, Task
 from torchrl_ocwm.evaluation import (
     EvaluationEnvs,
     ReconstructionError,
     Report,
+    episode_records,
     goal_images,
     imagined_distance,
     imagined_rollout,
     measure,
+    transition,
 )
+from torchrl_ocwm.evaluation.object_pictures import draw_errors, picture_objects
+from torchrl_ocwm.evaluation.objects import object_errors
 from torchrl_ocwm.evaluation.plots import heatmap, learning_curves
 from torchrl_ocwm.evaluation.videos import decode_video, mark, tile, write_video
+from torchrl_ocwm.modules import ObjectWorldModel
 from torchrl_ocwm.training.config import recipe
 from torchrl_ocwm.training.offline import CHECKPOINT
 
+CONTEXT = 5  # frames that are seen before the objects are imagined
 IMAGE_GOALS = ", image goals"
 CURVES = {
     "evaluation/final_score": "final score, landmark goals",
@@ -71,7 +77,8 @@ def main(config: DictConfig) -> None:
         heatmap(output / "heatmap.png", report.per_goal("final_score"), task.workspace, title="final score")
         if config.video_goals:
             chosen = torch.linspace(0, len(goals) - 1, config.video_goals).round().long()
-            _film(policies[-1], envs, goals[chosen], output / "episodes.mp4")
+            episodes = _film(policies[-1], envs, goals[chosen], output / "episodes.mp4")
+            _picture_objects(policies[-1].agent, episodes, output)
             if images is not None and policies[-1].takes_images:
                 _film(policies[-1], envs, goals[chosen], output / "episodes_image_goals.mp4", images[chosen])
     runs = {name: _folders(sources) for name, sources in report.sources.items() if not name.endswith(IMAGE_GOALS)}
@@ -110,21 +117,37 @@ def _evaluate(
     return {**measure(episodes), **errors}
 
 
-def _film(policy: Policy, envs: EvaluationEnvs, goals: Tensor, file: Path, images: Tensor | None = None) -> None:
+def _film(
+    policy: Policy, envs: EvaluationEnvs, goals: Tensor, file: Path, images: Tensor | None = None
+) -> TensorDictBase:
     """What happened, the goal as a cross; below, what the agent imagined would happen, from the first frame.
 
     Above both the goal image, where the agent was given one.
     """
     task = policy.agent.task
-    episodes = envs.run(policy, goals, images=images, keep=("pixels",), inspect=lambda step: {"latent": step["latent"]})
+
+    def inspect(step: TensorDictBase) -> dict[str, TensorDictBase]:
+        return {"latent": step["latent"], **transition(step)}
+
+    episodes = envs.run(policy, goals, images=images, inspect=inspect)
     latents = imagined_rollout(policy.agent, episodes["latent"][:, 0], envs.episode_steps)["latent"]
     imagined = decode_video(policy.agent.model, latents)
     with gymnasium.make(ENVIRONMENTS[task.name].id, **task.options) as env:
         points = torch.as_tensor(env.unwrapped.project(goals.numpy()))
-    rows = [mark(episodes["pixels"], points), mark(imagined, points)]
+    rows = [mark(episodes["transition", "next", "pixels"], points), mark(imagined, points)]
     if images is not None:
         rows.insert(0, images.unsqueeze(1).expand_as(rows[0]))
     write_video(file, tile(rows))
+    return episodes
+
+
+def _picture_objects(agent: Agent, episodes: TensorDictBase, output: Path) -> None:
+    """What an object-centric world model sees and imagines of the objects in these episodes."""
+    if isinstance(agent.model, ObjectWorldModel):
+        records = episode_records(episodes)
+        context = min(CONTEXT, records.shape[1] - 1)
+        picture_objects(output, agent.model, records, context, agent.task.objects)
+        draw_errors(output / "errors.png", object_errors(agent.model, records, context), agent.task.objects)
 
 
 if __name__ == "__main__":

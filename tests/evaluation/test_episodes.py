@@ -13,8 +13,15 @@ from torch import Tensor
 
 from torchrl_ocwm.agents import build_agent
 from torchrl_ocwm.envs import Task, make_task
-from torchrl_ocwm.evaluation import EvaluationEnvs, LandmarkEvaluation, ReconstructionError, goal_images
-from torchrl_ocwm.testing import reacher_task
+from torchrl_ocwm.evaluation import (
+    EvaluationEnvs,
+    LandmarkEvaluation,
+    ReconstructionError,
+    episode_records,
+    goal_images,
+    transition,
+)
+from torchrl_ocwm.testing import random_records, reacher_task
 
 
 def still(tensordict: TensorDictBase) -> TensorDictBase:
@@ -62,6 +69,21 @@ def test_episodes_move_with_the_policy(envs: EvaluationEnvs, task: Task) -> None
 
     assert travelled(still) < 1e-6
     assert travelled(push) > 1e-3
+
+
+def test_records_are_those_of_a_dataset(envs: EvaluationEnvs, task: Task) -> None:
+    """One more than steps: the first frame too, and with each frame the action that led to it."""
+    episodes = envs.run(push, goals(task, 3), inspect=transition)
+    records = episode_records(episodes)
+    assert records.shape == (3, 6)
+    assert records["is_init"].squeeze(-1).nonzero()[:, 1].tolist() == [0, 0, 0]
+    torch.testing.assert_close(records["action"][:, :, 0], torch.tensor([0.0, 1, 1, 1, 1, 1]).expand(3, 6))
+    seen = records["next", "object_position"]
+    torch.testing.assert_close(seen[:, 1:], episodes["object_position"])
+    assert not torch.equal(seen[:, 0], seen[:, 1])
+    assert records["next", "masks"].flatten(2).any(-1).all()
+    kept = set(random_records(task, 1, 2)["next"].keys())
+    assert kept - set(records["next"].keys()) <= {"object_position_true"}
 
 
 def test_goals_reach_the_environments_of_every_process(task: Task) -> None:

@@ -73,5 +73,6 @@ def test_from_dataset_to_film(collected: tuple[str, Path], agent: str, tmp_path:
         [of_goals] = row["per_goal"]
         assert len(of_goals["final_score"]) == 1
         assert all(0 < score <= 1 for score in of_goals["final_score"])
-    for picture in ("heatmap.png", "learning_curve.png", "episodes.mp4"):
+    objects = ("objects.png", "objects.mp4", "errors.png") if agent.startswith("focus") else ()
+    for picture in ("heatmap.png", "learning_curve.png", "episodes.mp4", *objects):
         assert (evaluation / picture).stat().st_size > 1000

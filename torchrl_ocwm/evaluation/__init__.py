@@ -3,7 +3,7 @@
 Needs the extra ``recipes``; ``plots`` and ``videos`` are imported from their modules.
 """
 
-from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, goal_images, measure
+from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, episode_records, goal_images, measure, transition
 from torchrl_ocwm.evaluation.imagined import imagined_distance, imagined_rollout
 from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation
 from torchrl_ocwm.evaluation.reconstruction import ReconstructionError
@@ -15,10 +15,12 @@ __all__ = [
     "LandmarkEvaluation",
     "ReconstructionError",
     "Report",
+    "episode_records",
     "goal_images",
     "imagined_distance",
     "imagined_rollout",
     "mean_and_error",
     "measure",
     "normalized_score",
+    "transition",
 ]

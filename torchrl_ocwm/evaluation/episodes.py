@@ -14,12 +14,14 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from tqdm import tqdm
 
+from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.envs import ENVIRONMENTS, Task, make_env
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.evaluation.scores import normalized_score
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 _KEPT = ("object_position", "object_position_true", "reward")
+_SEEN = ("pixels", "masks", "proprio", "object_position", "object_visible", "goal_position")
 
 
 class EvaluationEnvs:
@@ -116,6 +118,17 @@ class EvaluationEnvs:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+
+def transition(step: TensorDictBase) -> dict[str, TensorDictBase]:
+    """What a dataset keeps of a step, for ``inspect`` of :meth:`EvaluationEnvs.run`; see :func:`episode_records`."""
+    ends = [("next", name) for name in ("reward", "done", "terminated")]
+    return {"transition": step.select("action", *_SEEN, *(("next", name) for name in _SEEN), *ends).clone()}
+
+
+def episode_records(episodes: TensorDictBase) -> TensorDictBase:
+    """Records ``[N, T + 1]`` of episodes ``[N, T]`` that were run with ``inspect=transition``."""
+    return torch.stack([episode_to_records(episode) for episode in episodes["transition"]])
 
 
 def goal_images(task: Task, goals: Tensor) -> Tensor:

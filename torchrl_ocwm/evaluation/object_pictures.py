@@ -60,6 +60,15 @@ def object_rows(
     return {label: row.cpu() for label, row in rows.items()}
 
 
+def picture_objects(
+    folder: str | Path, model: ObjectWorldModel, records: TensorDictBase, context: int, names: Sequence[str]
+) -> None:
+    """Write ``objects.mp4`` and ``objects.png``; takes what :func:`object_rows` takes."""
+    rows = object_rows(model, records, context, names)
+    film_objects(Path(folder) / "objects.mp4", rows)
+    draw_objects(Path(folder) / "objects.png", rows, context)
+
+
 def film_objects(path: str | Path, rows: dict[str, Tensor]) -> None:
     """Write a video of :func:`object_rows`, one sequence per column."""
     write_video(path, tile(list(rows.values())), scale=2)
