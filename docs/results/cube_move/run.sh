@@ -27,7 +27,7 @@ evaluate() {  # folder, runs, agents...
     cp "$run/log/scalars/evaluation/final_score.csv" "$folder/$name.csv"
     echo "$name $(($(stat -c %Y "$run/checkpoint.zip") - $(stat -c %Y "$run/.hydra/config.yaml"))) s" >> "$folder/wall_time.txt"
   done
-  python examples/evaluate.py goals=${GOALS:-36} image_goals=true episode_steps=100 output="$folder" \
+  python examples/evaluate.py goals=${GOALS:-36} image_goals=true episode_steps=100 workers=0 envs=18 output="$folder" \
     "checkpoint=[${checkpoints#,}]"
 }
 
