@@ -140,9 +140,10 @@ def test_effects_are_off_by_default(open_camera, data, effect):
 
 
 def test_model_keeps_its_rendering_settings(open_camera, model):
-    model.vis.global_.offwidth, model.vis.quality.offsamples = 333, 4
+    model.vis.global_.offwidth, model.vis.quality.offsamples, model.vis.quality.shadowsize = 333, 4, 1024
     open_camera()
-    assert (model.vis.global_.offwidth, model.vis.quality.offsamples) == (333, 4)
+    quality = model.vis.quality
+    assert (model.vis.global_.offwidth, quality.offsamples, quality.shadowsize) == (333, 4, 1024)
 
 
 def test_geoms_that_turn_transparent_disappear(open_camera, model, data):

@@ -146,6 +146,11 @@ def test_starts_and_physics_are_those_of_robosuite(repeat):
     env.close()
 
 
+def test_a_state_reserves_little_memory(env):
+    """With robosuite's own limits it is 1.2 GB; twenty environments then leave no room for another process."""
+    assert env.model.narena == 64 * 2**20
+
+
 def test_start_states(env):
     env.reset(seed=0)
     starts = np.stack([env.reset()[0]["object_position_true"][0] for _ in range(20)])

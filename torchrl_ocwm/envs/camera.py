@@ -83,7 +83,7 @@ class Camera:
         self.model, self.height, self.width, self.mask_scale = model, height, width, mask_scale
         self._context: Any = None
         self._gl: Any = None
-        self._set_up(multisampling)
+        self._set_up(multisampling, shadows)
         self._scene = mujoco.MjvScene(model, maxgeom=max_geoms)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
@@ -101,20 +101,21 @@ class Camera:
     def _fine_size(self) -> tuple[int, int]:
         return self.mask_scale * self.height, self.mask_scale * self.width
 
-    def _set_up(self, multisampling: int) -> None:
-        """Make the OpenGL context; its buffers take their size and samples from the model, which stays unchanged."""
-        vis = self.model.vis
-        before = vis.quality.offsamples, vis.global_.offwidth, vis.global_.offheight
-        height, width = self._fine_size
-        vis.quality.offsamples, vis.global_.offwidth, vis.global_.offheight = multisampling, width, height
+    def _set_up(self, multisampling: int, shadows: bool) -> None:
+        """Make the OpenGL context; its buffers take their sizes and samples from the model, which stays unchanged."""
+        quality, view = self.model.vis.quality, self.model.vis.global_
+        before = quality.offsamples, quality.shadowsize, view.offwidth, view.offheight
+        quality.offsamples, (view.offheight, view.offwidth) = multisampling, self._fine_size
+        if not shadows:
+            quality.shadowsize = 0  # tens of MiB
         try:
-            self._gl = context_class()(width, height)
+            self._gl = context_class()(view.offwidth, view.offheight)
             self._gl.make_current()
             self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
         except Exception as error:  # each OpenGL binding raises an error class of its own
             raise renderer_error(error) from error
         finally:
-            vis.quality.offsamples, vis.global_.offwidth, vis.global_.offheight = before
+            quality.offsamples, quality.shadowsize, view.offwidth, view.offheight = before
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         close_at_exit(self)

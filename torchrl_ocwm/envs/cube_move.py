@@ -55,6 +55,7 @@ _COLLISION_GROUP = 0
 _STEP = 0.05  # asked for by an action of 1
 _NEAR, _HOVER, _LIFT = 0.015, 0.1, 0.04
 _OPEN, _STILL = 0.035, 0.01  # of a finger, metres and metres per second
+_ARENA = "64M"  # for contacts; robosuite's own limits make MuJoCo reserve 1.2 GB for each state
 _CUBE_SIZE_SEED = 0  # robosuite draws the edges of the cube when it loads the model
 
 
@@ -204,6 +205,9 @@ class _Table(Lift):
 
     def _load_model(self) -> None:
         super()._load_model()
+        size = self.model.root.find("size")
+        size.attrib.clear()
+        size.set("memory", _ARENA)
         self._samplers = [self.placement_initializer]
         if self._with_distractor:
             self._add_distractor()
