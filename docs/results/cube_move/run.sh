@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# What docs/results/cube_move shows: three agents on scripted and random data, then two of them go on with data of their own.
+# What docs/results/cube_move shows: three agents on scripted and random data; two of them then go on with their own.
 # One thread each, two runs at a time. Run from the repository root; what is done already is not done again.
 # On a GPU: SIZE=paper UPDATES=250000 STEPS=1000000 GOALS=100 DEVICE=cuda docs/results/cube_move/run.sh
 set -eu
@@ -19,16 +19,14 @@ evaluate() {  # folder, runs, agents...
   local folder=$1 runs=$2 checkpoints=""
   shift 2
   mkdir -p "$folder"
-  : > "$folder/wall_time.txt"
   for agent in "$@"; do
     local run=$runs/$agent/$size/seed_0 name=${agent}_seed_0
     checkpoints+=,$run/checkpoint.zip
     cp "$run/.hydra/config.yaml" "$folder/$name.yaml"
     cp "$run/log/scalars/evaluation/final_score.csv" "$folder/$name.csv"
-    echo "$name $(($(stat -c %Y "$run/checkpoint.zip") - $(stat -c %Y "$run/.hydra/config.yaml"))) s" >> "$folder/wall_time.txt"
   done
-  python examples/evaluate.py goals=${GOALS:-36} image_goals=true episode_steps=100 workers=0 envs=18 output="$folder" \
-    "checkpoint=[${checkpoints#,}]"
+  python examples/evaluate.py goals=${GOALS:-36} image_goals=true episode_steps=100 workers=0 envs=18 \
+    output="$folder" "checkpoint=[${checkpoints#,}]"
 }
 
 collect scripted $((steps * 25 / 32)) data/cube_move
@@ -38,7 +36,7 @@ train focus_pcp $first data/cube_move "$updates"
 wait
 evaluate $here $first dreamer focus_pcp focus_lcp
 
-# The second round: what the agents do themselves, added to the data.
+# What the agents do themselves, added to the data.
 if [ ! -d $own ]; then
   cp -r data/cube_move data/cube_move_own
   for agent in focus_pcp focus_lcp; do
@@ -46,12 +44,14 @@ if [ ! -d $own ]; then
     cp -r "$first/$agent/$size" "$own/$agent/"
   done
 fi
-more=$((steps * 6 / 32))
-collect $first/focus_pcp/"$size"/seed_0/checkpoint.zip $((steps + more)) data/cube_move_own
-collect $first/focus_lcp/"$size"/seed_0/checkpoint.zip $((steps + 2 * more)) data/cube_move_own
+collect $first/focus_pcp/"$size"/seed_0/checkpoint.zip $((steps * 38 / 32)) data/cube_move_own
+collect $first/focus_lcp/"$size"/seed_0/checkpoint.zip $((steps * 44 / 32)) data/cube_move_own
 train focus_lcp $own data/cube_move_own $((updates * 7 / 4)) &
 train focus_pcp $own data/cube_move_own $((updates * 7 / 4))
 wait
-evaluate $here/own_data $own focus_pcp focus_lcp
 python examples/diagnose.py checkpoint="$own/focus_lcp/$size/seed_0/checkpoint.zip" dataset=data/cube_move_own \
   output=$here/diagnosis
+# Once more for one of them.
+collect $own/focus_pcp/"$size"/seed_0/checkpoint.zip $((steps * 52 / 32)) data/cube_move_own
+train focus_pcp $own data/cube_move_own $((updates * 10 / 4))
+evaluate $here/own_data $own focus_lcp focus_pcp
