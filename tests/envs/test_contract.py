@@ -113,7 +113,7 @@ def state(env: PositioningEnv) -> np.ndarray:
     return values
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("name", ["reacher", *(pytest.param(name, marks=pytest.mark.slow) for name in [*CASES][1:])])
 def test_gymnasium_checker(name: str) -> None:
     env = gymnasium.make(ENVIRONMENTS[name].id, render_mode="rgb_array", image_size=16)
     with warnings.catch_warnings(record=True) as caught:
@@ -334,7 +334,7 @@ def test_missing_simulator_says_what_to_install(monkeypatch: pytest.MonkeyPatch,
             make_env(name)
     module = ENVIRONMENTS[name].entry_point.split(":")[0]
     monkeypatch.delitem(sys.modules, module, raising=False)
-    for loaded in [loaded for loaded in sys.modules if loaded.split(".")[0] == case.package]:
+    for loaded in [case.package, *(loaded for loaded in sys.modules if loaded.startswith(f"{case.package}."))]:
         monkeypatch.setitem(sys.modules, loaded, None)
     with pytest.raises(ModuleNotFoundError, match=what):
         importlib.import_module(module)
