@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from observations import actions, assert_same, error
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_ocwm.envs import ENVIRONMENTS, Task, make_env, make_task, registry
-from torchrl_ocwm.envs.positioning import Observation, PositioningEnv
+from torchrl_ocwm.envs.positioning import PositioningEnv
 
 
 class Case(NamedTuple):
@@ -88,21 +89,6 @@ def still(env: PositioningEnv) -> np.ndarray:
     if len(action) == 4:
         action[3] = -1
     return action
-
-
-def actions(env: PositioningEnv, number: int) -> np.ndarray:
-    return np.random.default_rng(0).uniform(-1, 1, (number, *env.action_space.shape))
-
-
-def assert_same(first: Observation, second: Observation) -> None:
-    assert first.keys() == second.keys()
-    for key in first:
-        assert np.array_equal(first[key], second[key]), key
-
-
-def error(observation: Observation) -> float:
-    """Distance between estimated and true position, millimetres."""
-    return 1000 * float(np.linalg.norm(observation["object_position"] - observation["object_position_true"]))
 
 
 def state(env: PositioningEnv) -> np.ndarray:

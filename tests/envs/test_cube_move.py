@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.seeding import np_random
+from observations import actions, assert_same, error
 from robosuite.controllers import load_composite_controller_config, load_part_controller_config
 from robosuite.environments.manipulation.lift import Lift
 
@@ -36,16 +37,6 @@ def pair():
     env.close()
 
 
-def actions(number: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-1, 1, (number, 4))
-
-
-def assert_same(first, second):
-    assert first.keys() == second.keys()
-    for key in first:
-        assert np.array_equal(first[key], second[key]), key
-
-
 def pixel(x: float, y: float, z: float) -> tuple[float, float]:
     """Column and row at which a point in the world is seen, by hand."""
     ray = np.array([x, y, z]) - EYE
@@ -58,11 +49,6 @@ def with_cube_at(env: CubeMove, x: float, y: float, z: float, turn: float = 0.0)
     env.data.qpos[address : address + 7] = x, y, z, np.cos(turn / 2), 0, 0, np.sin(turn / 2)
     mujoco.mj_forward(env.model, env.data)
     return env._observe(env.data)
-
-
-def error(observation, index: int = 0) -> float:
-    """Distance between estimated and true position, millimetres."""
-    return 1000 * float(np.linalg.norm((observation["object_position"] - observation["object_position_true"])[index]))
 
 
 def move_to(env: CubeMove, observation, target, steps: int):
@@ -137,7 +123,7 @@ def test_starts_and_physics_are_those_of_robosuite(repeat):
     original.rng.uniform(size=2)  # the goal
     original.reset()
     assert np.array_equal(env.data.qpos, original.sim.data.qpos)
-    for action in actions(8):
+    for action in actions(env, 8):
         env.step(action)
         for _ in range(repeat):
             original.step(action)

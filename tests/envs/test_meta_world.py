@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from metaworld.envs.sawyer_pick_place_v3 import SawyerPickPlaceEnvV3
 from metaworld.envs.sawyer_shelf_place_v3 import SawyerShelfPlaceEnvV3
+from observations import actions, error
 
 from torchrl_ocwm.envs import PickPlace, ShelfPlace
 
@@ -38,10 +39,6 @@ def small(name):
     env.close()
 
 
-def actions(number: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-1, 1, (number, 4))
-
-
 def pixel(name: str, point) -> tuple[float, float]:
     """Column and row at which a point in the world is seen, by hand."""
     middle, view = VIEWS[name]
@@ -57,11 +54,6 @@ def with_object_at(env, x: float, y: float, z: float):
     env.data.qpos[9:16] = x, y, z, 1, 0, 0, 0
     mujoco.mj_forward(env.model, env.data)
     return env._observe(env.data)
-
-
-def error(observation) -> float:
-    """Distance between estimated and true position, millimetres."""
-    return 1000 * float(np.linalg.norm(observation["object_position"] - observation["object_position_true"]))
 
 
 # The data contract.
@@ -126,7 +118,7 @@ def test_starts_and_physics_are_those_of_meta_world(name, repeat):
     original._set_task_called = True
     original.reset()
     assert np.array_equal(env.data.qpos, original.data.qpos)
-    for action in actions(10):
+    for action in actions(env, 10):
         env.step(action)
         for _ in range(repeat):
             original.step(action)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from dm_control import suite
 from dm_control.suite import reacher as dm_reacher
+from observations import actions, assert_same, error
 
 from torchrl_ocwm.envs import Reacher
 
@@ -24,22 +25,12 @@ def env():
     env.close()
 
 
-def actions(number: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-1, 1, (number, 2))
-
-
-def assert_same(first, second):
-    assert first.keys() == second.keys()
-    for key in first:
-        assert np.array_equal(first[key], second[key]), key
-
-
 # The data contract.
 
 
 def test_true_position_and_proprio_follow_the_joints(env):
     env.reset(seed=1)
-    for action in actions(5):
+    for action in actions(env, 5):
         observation, *_ = env.step(action)
         shoulder, wrist = env.data.qpos
         expected = LINK * np.array(
@@ -79,8 +70,7 @@ def test_image_size(image_size):
     assert observation["pixels"].shape == (3, image_size, image_size)
     assert observation["masks"].shape == (1, image_size, image_size)
     # A pixel is 62 cm / image_size wide: 45 degrees, 75 cm above the table.
-    error = np.linalg.norm(observation["object_position"] - observation["object_position_true"])
-    assert error < 0.62 / image_size
+    assert error(observation) < 620 / image_size
 
 
 def test_the_task_has_no_target_of_its_own_in_the_picture(env):
@@ -124,7 +114,7 @@ def test_two_control_steps_per_step_by_default(env):
     data = mujoco.MjData(model)
     data.qpos[:] = env.data.qpos
     mujoco.mj_forward(model, data)
-    for action in actions(20):
+    for action in actions(env, 20):
         env.step(action)
         data.ctrl[:] = action
         mujoco.mj_step(model, data)
@@ -144,7 +134,7 @@ def test_physics_are_those_of_dm_control(repeat):
     with original.physics.reset_context():
         original.physics.data.qpos[:] = env.data.qpos
         original.physics.data.qvel[:] = 0
-    for action in actions(10):
+    for action in actions(env, 10):
         env.step(action)
         for _ in range(repeat):
             original.step(action)
@@ -172,14 +162,14 @@ def test_position_error_over_random_poses(mask_scale, median, rare):
     assert np.percentile(errors, 95) < rare
 
 
-@pytest.mark.parametrize(("visible", "error"), [(True, 5.0), (False, np.nan)])
-def test_position_error_sees_hidden_poses_and_wrong_positions(visible, error):
+@pytest.mark.parametrize(("visible", "expected"), [(True, 5.0), (False, np.nan)])
+def test_position_error_sees_hidden_poses_and_wrong_positions(visible, expected):
     observation = {
         "object_position": np.array([[0.103, 0.204]]),
         "object_position_true": np.array([[0.1, 0.2]]),
         "object_visible": np.array([visible]),
     }
-    assert load_benchmark().millimetres(observation) == pytest.approx(error, abs=1e-6, nan_ok=True)
+    assert load_benchmark().millimetres(observation) == pytest.approx(expected, abs=1e-6, nan_ok=True)
 
 
 def test_finer_masks_are_sampled_at_the_size_of_the_images(env):
