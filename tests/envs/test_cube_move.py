@@ -8,7 +8,6 @@ import sys
 import mujoco
 import numpy as np
 import pytest
-import torch
 from gymnasium.utils.seeding import np_random
 from observations import actions, assert_same, error
 from robosuite.controllers import load_composite_controller_config, load_part_controller_config
@@ -204,46 +203,30 @@ def test_position_of_a_cube_in_the_air(env, height):
 # Virtual target.
 
 
-def test_virtual_target(env):
-    plain, _ = env.reset(seed=17, options={"goal_position": (-0.1, 0.12)})
-    env.virtual_target = 6
-    try:
-        painted, _ = env.reset(seed=17, options={"goal_position": (-0.1, 0.12)})
-        there, _ = env.reset(seed=17, options={"goal_position": plain["object_position"][0]})
-    finally:
-        env.virtual_target = 0
+def test_virtual_target_lies_at_the_goal(env, monkeypatch):
+    start = {"seed": 17, "options": {"goal_position": (-0.1, 0.12)}}
+    plain, _ = env.reset(**start)
+    monkeypatch.setattr(env, "virtual_target", 6)
+    painted, _ = env.reset(**start)
     rows, columns = np.nonzero((plain["pixels"] != painted["pixels"]).any(0))
     column, row = pixel(-0.1, 0.12, 0.82)
     assert len(rows) == pytest.approx(np.pi * 9, rel=0.2)
     assert columns.mean() + 0.5 == pytest.approx(column, abs=0.5)
     assert rows.mean() + 0.5 == pytest.approx(row, abs=0.5)
-    cube = plain["masks"][0]
-    assert np.array_equal(there["pixels"][:, cube], plain["pixels"][:, cube])
-    for key in set(plain) - {"pixels"}:
-        assert np.array_equal(plain[key], painted[key])
 
 
 # Goal observations.
 
 
-def test_goal_observation_shows_the_cube_at_the_goal(env):
+def test_goal_observation_shows_the_arm_at_rest_and_the_cube_on_the_table(env):
     env.reset(seed=18)
+    start = env.goal_observation((0.0, 0.0))
     for _ in range(3):
         env.step(np.array([1.0, 0.0, -1.0, 1.0]))  # the arm reaches over the table
-    start = env.goal_observation((0.0, 0.0))
-    for goal in [*env.workspace.grid(4).flatten(0, 1).tolist(), (-0.25, 0.0), (-0.25, -0.25), (0.25, 0.25)]:
-        observation = env.goal_observation(np.array(goal))
-        assert env.observation_space.contains(observation)
-        assert observation["object_position_true"][0] == pytest.approx(np.array(goal), abs=1e-6)
-        assert observation["goal_position"] == pytest.approx(np.array(goal))
-        assert observation["object_visible"].tolist() == [True]
-        assert error(observation) < 8
-        assert np.array_equal(observation["proprio"], start["proprio"])
-        assert not observation["proprio"][7:14].any()
-    # The cube lies on the table.
-    scratch = env._scratch
-    height = scratch.geom_xpos[env.model.geom("cube_g0_vis").id, 2] - env.model.geom("cube_g0_vis").size[2]
-    assert height == pytest.approx(0.8, abs=1e-6)
+    for goal in [(0.0, 0.0), (-0.25, -0.25), (0.25, 0.25)]:
+        assert np.array_equal(env.goal_observation(goal)["proprio"], start["proprio"])
+        height = env._scratch.geom_xpos[env.model.geom("cube_g0_vis").id, 2] - env.model.geom("cube_g0_vis").size[2]
+        assert height == pytest.approx(0.8, abs=1e-6)
 
 
 # A second cube.
@@ -286,14 +269,10 @@ def test_unknown_objects(objects):
 # Names, resources and noise.
 
 
-def test_task_describes_the_environment_also_through_json():
+def test_task_with_a_distractor_through_json():
     task = make_task("cube_move", objects=["cube", "distractor"], image_size=16, horizon=9)
-    assert (task.objects, task.proprio, task.action, task.image_size) == (("cube", "distractor"), 19, 4, 16)
-    assert task.workspace == CubeMove.workspace
-    assert task.workspace.contains(torch.tensor(task.workspace.landmarks)).all()
-    assert len(set(task.workspace.landmarks)) == 10
-    again = Task.from_dict(json.loads(json.dumps(task.to_dict())))
-    assert again == task
+    assert task.objects == ("cube", "distractor")
+    assert Task.from_dict(json.loads(json.dumps(task.to_dict()))) == task
 
 
 @pytest.mark.slow
