@@ -245,15 +245,19 @@ def test_goals_outside_the_workspace(env: PositioningEnv, case: Case) -> None:
 # Actions and seeds.
 
 
-def test_actions_are_clipped(env: PositioningEnv, twin: PositioningEnv) -> None:
+def test_actions_are_clipped(
+    env: PositioningEnv, twin: PositioningEnv, case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beyond = np.array([3.0, -7.0, 1.5, -2.0])[: case.actions]
+    clipped = np.array([1.0, -1.0, 1.0, -1.0])[: case.actions]
     env.reset(seed=8)
     twin.reset(seed=8)
-    size = len(still(env))
-    first, second = (
-        env.step(np.array([3.0, -7.0, 1.5, -2.0])[:size]),
-        twin.step(np.array([1.0, -1.0, 1.0, -1.0])[:size]),
-    )
-    assert_same(first[0], second[0])
+    assert_same(env.step(beyond)[0], twin.step(clipped)[0])
+    # The simulators clip too.
+    received: list[np.ndarray] = []
+    monkeypatch.setattr(env, "_step_simulator", received.append)
+    env.step(beyond)
+    assert np.array_equal(received, [clipped] * env.action_repeat)
 
 
 def test_same_seed_same_everything(env: PositioningEnv, twin: PositioningEnv) -> None:
