@@ -35,6 +35,52 @@ def test_script_reaches_the_landmarks(name, steps):
     env.close()
 
 
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        ("cube_move", (0.05, 0.0, 0.0)),
+        ("cube_move", (0.0, -0.05, 0.03)),
+        ("cube_move", (0.0, 0.0, 0.07)),
+        ("shelf_place", (0.06, 0.0, 0.08)),
+        ("pick_place", (0.0, -0.06, 0.0)),
+    ],
+)
+def test_a_hand_that_misses_goes_to_the_goal_without_the_object(name, error):
+    env = gymnasium.make(ENVIRONMENTS[name].id, image_size=16).unwrapped
+    goal = env.workspace.landmarks[4]
+    env.reset(seed=0, options={"goal_position": goal})
+    for _ in range(60):
+        observation, *_ = env.step(env.scripted_action(error=error))
+    hand = env.data.site_xpos[env._gripper] if name == "cube_move" else env.data.xpos[env._hand]
+    assert (hand - env._start)[0] == pytest.approx(goal[0], abs=0.02)
+    assert np.linalg.norm(observation["object_position_true"][0] - goal) > 0.08
+    env.close()
+
+
+def test_share_of_misses():
+    torch.manual_seed(0)
+    transform, errors = ScriptedAction(misses=0.3), []
+    for _ in range(2000):
+        transform._aim(torch.zeros(2))
+        errors.append(transform._error)
+    errors = torch.stack(errors)
+    missed = errors[errors.any(-1)]
+    assert len(missed) / len(errors) == pytest.approx(0.3, abs=0.04)
+    assert torch.allclose(missed.amin(0), torch.tensor([-0.06, -0.06, 0.0]), atol=0.003)
+    assert torch.allclose(missed.amax(0), torch.tensor([0.06, 0.06, 0.08]), atol=0.003)
+
+
+def test_the_transform_tells_the_environment_of_the_miss(reacher, monkeypatch):
+    transform, told = reacher.transform[-1], []
+    monkeypatch.setattr(transform, "misses", 1.0)
+    simulator = reacher.base_env._env.unwrapped
+    monkeypatch.setattr(simulator, "scripted_action", lambda _, error: told.append(error) or np.zeros(2, np.float32))
+    reacher.rollout(3, follow)
+    assert len(told) == 4
+    assert all(np.array_equal(error, told[0]) for error in told)
+    assert told[0].any()
+
+
 def test_goal_of_its_own(reacher):
     env = reacher.base_env._env.unwrapped
     reacher.reset()
@@ -81,9 +127,15 @@ def test_environment_without_a_script(monkeypatch):
         pass
 
     with pytest.raises(NotImplementedError, match="Plain has no scripted policy; collect with policy=random"):
-        Plain._scripted_action(Plain.__new__(Plain), np.zeros(2))
+        Plain._scripted_action(Plain.__new__(Plain), np.zeros(2), np.zeros(3))
 
 
 def test_no_patience():
     with pytest.raises(ValueError, match="patience must be at least 1 step, got 0"):
         ScriptedAction(patience=0)
+
+
+@pytest.mark.parametrize("misses", [-0.1, 1.1])
+def test_no_share(misses):
+    with pytest.raises(ValueError, match="misses must be a share between 0 and 1"):
+        ScriptedAction(misses=misses)

@@ -54,7 +54,7 @@ _COLLISION_GROUP = 0
 # Of the scripted policy, metres.
 _STEP = 0.05  # asked for by an action of 1
 _NEAR, _HOVER, _LIFT = 0.015, 0.1, 0.04
-_OPEN, _STILL = 0.035, 0.01  # of a finger, metres and metres per second
+_OPEN, _EMPTY, _STILL = 0.035, 0.012, 0.01  # of a finger, metres and metres per second; around the cube it is at 0.02
 _ARENA = "64M"  # for contacts; robosuite's own limits make MuJoCo reserve 1.2 GB for each state
 _CUBE_SIZE_SEED = 0  # robosuite draws the edges of the cube when it loads the model
 
@@ -164,16 +164,18 @@ class CubeMove(PositioningEnv):
         data.qpos[self._cube : self._cube + 7] = *(self._start[:2] + position), height, 1, 0, 0, 0
         data.qvel[:] = 0
 
-    def _scripted_action(self, goal: np.ndarray) -> np.ndarray:
+    def _scripted_action(self, goal: np.ndarray, error: np.ndarray) -> np.ndarray:
         """Grasp the cube from above and carry it, lifted a little."""
-        cube, gripper = self._true_position(self.data)[0], self.data.site_xpos[self._gripper]
+        gripper, fingers = self.data.site_xpos[self._gripper], self.data.qpos[self._fingers]
+        missed = error.any() and fingers[0] < _EMPTY
+        cube = gripper if missed else self._true_position(self.data)[0] + error
         off, grip = cube - gripper, -1.0
         aside = np.linalg.norm(off[:2])
         if aside > _NEAR:  # fly over the cube, unless it is all but there
             off[2] += _HOVER
         elif abs(off[2]) < _NEAR:
             grip = 1.0
-            if self.data.qpos[self._fingers[0]] < _OPEN and abs(self.data.qvel[self._finger_velocity]) < _STILL:
+            if fingers[0] < _OPEN and abs(self.data.qvel[self._finger_velocity]) < _STILL:
                 off = np.array([*(self._start[:2] + goal), _TABLE + _LIFT]) - cube
         return np.array([*off / _STEP, grip])
 

@@ -29,6 +29,8 @@ _SUBSTEPS = 5  # of the physics in a control step
 _OPEN, _CLOSED = (-1.0, 1.0), (1.0, -1.0)  # of the two fingers
 _DOWN = (1.0, 0.0, 1.0, 0.0)  # Meta-World's quaternion of a hand that points down
 _HAND_ABOVE_OBJECT = np.array([0.0, 0.0, 0.04])  # metres, where Meta-World's policy grasps
+_SHUT, _IN_HAND = 0.05, 0.07  # of the fingers, and of the object from the hand, metres
+_SIDEWAYS = np.array([1.0, 1.0, 0.0])
 _SETTLE = (50, 20)  # control steps: Meta-World's own number to move the hand, then the fingers
 
 
@@ -121,12 +123,15 @@ class _MetaWorld(PositioningEnv):
         data.qpos[self._object_qpos : self._object_qpos + 7] = *place, 1, 0, 0, 0
         data.qvel[-6:] = 0
 
-    def _scripted_action(self, goal: np.ndarray) -> np.ndarray:
+    def _scripted_action(self, goal: np.ndarray, error: np.ndarray) -> np.ndarray:
         # Meta-World's policy for pick-place brings the hand to a goal: it is told one that is off by as much as the
         # hand is off the object.
-        hand, thing = self.data.xpos[self._hand], self.data.xpos[self._object]
+        hand, thing, opening = self.data.xpos[self._hand], self.data.xpos[self._object], self._opening(self.data)
+        if error.any():
+            missed = opening < _SHUT and np.linalg.norm(thing - hand) > _IN_HAND
+            thing = hand if missed else thing + error * _SIDEWAYS  # higher up, the policy would not close the hand
         state = np.zeros(39)
-        state[:3], state[3], state[4:7] = hand, min(self._opening(self.data) / 0.1, 1), thing
+        state[:3], state[3], state[4:7] = hand, min(opening / 0.1, 1), thing
         state[-3:] = self._world(goal) + hand - thing
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it warns about each action that is to be clipped

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium
@@ -136,20 +137,24 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     def _action_shape(self) -> tuple[int, ...]:
         return (self.model.nu,)
 
-    def scripted_action(self, goal_position: np.ndarray | None = None) -> np.ndarray:
+    def scripted_action(
+        self, goal_position: np.ndarray | None = None, error: np.ndarray | Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> np.ndarray:
         """The action (A,) of a hand-written policy that brings the first object to a goal, from the true state.
 
         Args:
             goal_position: (D,) metres; the goal of the episode by default.
+            error: How far from the object it is believed to be, (3,) metres in the axes of the world. A hand that
+                closes there on nothing goes to the goal without the object. Nothing to a robot that does not grasp.
 
         Raises:
             ValueError: for a goal outside the workspace.
             NotImplementedError: if the environment has no such policy.
         """
         goal = self._goal if goal_position is None else self._check_goal(goal_position)
-        return self._scripted_action(goal).clip(-1, 1).astype(np.float32)
+        return self._scripted_action(goal, np.asarray(error)).clip(-1, 1).astype(np.float32)
 
-    def _scripted_action(self, goal: np.ndarray) -> np.ndarray:
+    def _scripted_action(self, goal: np.ndarray, error: np.ndarray) -> np.ndarray:
         """What :meth:`scripted_action` does, without bounds; an environment may go without."""
         raise NotImplementedError(f"{type(self).__name__} has no scripted policy; collect with policy=random")
 

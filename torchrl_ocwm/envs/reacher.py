@@ -92,10 +92,10 @@ class Reacher(PositioningEnv):
         data.qpos[:] = _joint_angles(position)
         data.qvel[:] = 0
 
-    def _scripted_action(self, goal: np.ndarray) -> np.ndarray:
-        error = _joint_angles(goal) - self.data.qpos
-        error[0] = (error[0] + np.pi) % (2 * np.pi) - np.pi  # the shoulder turns freely
-        return _STIFFNESS * error - _DAMPING * self.data.qvel
+    def _scripted_action(self, goal: np.ndarray, error: np.ndarray) -> np.ndarray:  # noqa: ARG002
+        angles = _joint_angles(goal) - self.data.qpos
+        angles[0] = (angles[0] + np.pi) % (2 * np.pi) - np.pi  # the shoulder turns freely
+        return _STIFFNESS * angles - _DAMPING * self.data.qvel
 
 
 def _joint_angles(position: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import Transform
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from torchrl_ocwm.envs.positioning import PositioningEnv
 
 _ARRIVED = 0.02  # metres
+_MISS = ((-0.06, 0.06), (-0.06, 0.06), (0.0, 0.08))  # of the place where the object is believed to be, metres
 
 
 class ScriptedAction(Transform):
@@ -23,8 +25,13 @@ class ScriptedAction(Transform):
     its goal. Where the object has arrived, or when it takes too long, the next target is drawn uniformly in the
     workspace, so that the object keeps moving through an episode.
 
+    For some targets the policy misjudges where the object is, by up to 6 cm to each side and 8 cm upwards, closes the
+    hand on nothing and carries on without the object. Without such data a world model learns that an object follows
+    whatever the hand does.
+
     Args:
         patience: Steps until a target is given up.
+        misses: Share of the targets for which the object is misjudged.
         action_key: Key written, ``[A]`` float32 in [−1, 1].
 
     Raises:
@@ -38,26 +45,34 @@ class ScriptedAction(Transform):
         >>> env.close()
     """
 
-    def __init__(self, *, patience: int = 60, action_key: NestedKey = "scripted_action") -> None:
+    def __init__(self, *, patience: int = 60, misses: float = 0.3, action_key: NestedKey = "scripted_action") -> None:
         super().__init__(in_keys=["object_position_true"], out_keys=[action_key])
         if patience < 1:
             raise ValueError(f"patience must be at least 1 step, got {patience}")
-        self.patience = patience
-        self._target, self._left = torch.empty(0), 0
+        if not 0 <= misses <= 1:
+            raise ValueError(f"misses must be a share between 0 and 1, got {misses}")
+        self.patience, self.misses = patience, misses
+        self._target, self._error, self._left = torch.empty(0), torch.zeros(3), 0
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
-        self._target, self._left = tensordict_reset["goal_position"], self.patience
+        self._aim(tensordict_reset["goal_position"])
         return self._write(tensordict_reset)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._left -= 1
         position = next_tensordict.get(self.in_keys[0])[0]
         if self._left == 0 or (position - self._target).norm() < _ARRIVED:
-            self._target, self._left = self._simulator.workspace.sample(), self.patience
+            self._aim(self._simulator.workspace.sample())
         return self._write(next_tensordict)
 
+    def _aim(self, target: Tensor) -> None:
+        self._target, self._left = target, self.patience
+        low, high = torch.tensor(_MISS).T
+        misses = torch.rand(()) < self.misses
+        self._error = misses * (low + (high - low) * torch.rand(3))
+
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self._simulator.scripted_action(self._target.numpy())
+        action = self._simulator.scripted_action(self._target.numpy(), self._error.numpy())
         return tensordict.set(self.out_keys[0], torch.from_numpy(action))
 
     @property
