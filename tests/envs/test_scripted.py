@@ -42,7 +42,7 @@ def test_script_reaches_the_landmarks(name, steps):
         ("cube_move", (0.0, -0.05, 0.03)),
         ("cube_move", (0.0, 0.0, 0.07)),
         ("shelf_place", (0.06, 0.0, 0.08)),
-        ("pick_place", (0.0, -0.06, 0.0)),
+        ("pick_place", (0.06, 0.0, 0.08)),
     ],
 )
 def test_a_hand_that_misses_goes_to_the_goal_without_the_object(name, error):
