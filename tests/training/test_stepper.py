@@ -1,12 +1,13 @@
-"""One update: mixed precision."""
+"""One update: mixed precision and learning rates."""
 
+import pytest
 import torch
 from tensordict import TensorDictBase
 
 from torchrl_ocwm.agents import build_agent
 from torchrl_ocwm.testing import random_records, reacher_task
 from torchrl_ocwm.training.settings import Training
-from torchrl_ocwm.training.stepper import make_stepper
+from torchrl_ocwm.training.stepper import make_schedule, make_stepper
 
 
 def first_update(mixed_precision: bool) -> tuple[TensorDictBase, list[torch.dtype], list[torch.dtype]]:
@@ -29,3 +30,26 @@ def test_mixed_precision_works_on_a_cpu() -> None:
     for name in ("loss_model_object_position", "loss_model_masks", "loss_model_image_latent"):
         assert mixed[name] != single[name]
         torch.testing.assert_close(mixed[name].float(), single[name], rtol=0.02, atol=0.02)
+
+
+def rates(training: Training, state: dict | None = None) -> tuple[list[float], dict]:
+    """Learning rates at four updates, the first of which is at the given state, and the state after them."""
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(()))], lr=2.0)
+    schedule = make_schedule(optimizer, training)
+    if state is not None:
+        schedule.load_state_dict(state)
+    seen = []
+    for _ in range(4):
+        optimizer.step()
+        schedule.step()
+        seen.append(optimizer.param_groups[0]["lr"])
+    return seen, schedule.state_dict()
+
+
+def test_learning_rates_fall_linearly_and_stay_at_the_end() -> None:
+    assert rates(Training(updates=3, log_interval=1, final_lr=0.1))[0] == pytest.approx([1.4, 0.8, 0.2, 0.2])
+
+
+def test_a_run_that_goes_on_for_longer_follows_its_new_settings() -> None:
+    _, finished = rates(Training(updates=4, log_interval=1, final_lr=0.1))
+    assert rates(Training(updates=8, log_interval=1, final_lr=0.2), finished)[0] == pytest.approx([1.0, 0.8, 0.6, 0.4])

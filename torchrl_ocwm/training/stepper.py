@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LinearLR
+from torch.optim.lr_scheduler import LambdaLR
 from torchrl.objectives import SoftUpdate
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper, DreamerV3Optimizer
 
@@ -26,9 +26,10 @@ def make_optimizer(agent: Agent) -> DreamerV3Optimizer:
     )
 
 
-def make_schedule(optimizer: Optimizer, training: Training) -> LinearLR:
-    """Learning rates that fall linearly over a run."""
-    return LinearLR(optimizer, 1.0, training.final_lr, total_iters=training.updates)
+def make_schedule(optimizer: Optimizer, training: Training) -> LambdaLR:
+    """Learning rates that fall linearly over a run; a run that goes on for longer follows its new settings."""
+    # LinearLR keeps the old length in its state, and with it the lowest rates for all that is added to a run.
+    return LambdaLR(optimizer, lambda update: 1 - (1 - training.final_lr) * min(update / training.updates, 1))
 
 
 class Stepper(DreamerV3OptimizationStepper):
