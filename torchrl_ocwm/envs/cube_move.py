@@ -81,6 +81,8 @@ class CubeMove(PositioningEnv):
         objects: ``("cube",)``, or ``("cube", "distractor")`` for a second, blue cube that starts within 15 cm of the
             middle of the table.
         horizon: Steps per episode.
+        mask_scale: Positions from a segmentation twice as fine as the images halve their error at no cost that could
+            be measured (docs/results/benchmarks.md).
         options: See :class:`~torchrl_ocwm.envs.PositioningEnv`.
 
     Raises:
@@ -116,11 +118,13 @@ class CubeMove(PositioningEnv):
     camera_name = "agentview"
     depth_offset = 0.013  # no bias on average over positions and turns of the cube, at 64 x 64 and at 256 x 256
 
-    def __init__(self, *, objects: Sequence[str] = ("cube",), horizon: int = 250, **options: Any) -> None:
+    def __init__(
+        self, *, objects: Sequence[str] = ("cube",), horizon: int = 250, mask_scale: int = 2, **options: Any
+    ) -> None:
         if tuple(objects) not in (("cube",), ("cube", "distractor")):
             raise ValueError(f"objects must be ('cube',) or ('cube', 'distractor'), got {tuple(objects)}")
         self.objects = {name: _GEOMS[name] for name in objects}
-        super().__init__(horizon=horizon, **options)
+        super().__init__(horizon=horizon, mask_scale=mask_scale, **options)
 
     def _load(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
         with _quiet():

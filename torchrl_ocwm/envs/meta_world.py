@@ -48,8 +48,8 @@ class _MetaWorld(PositioningEnv):
     #: Where Meta-World's own goal is at a reset, metres; it places the shelf.
     _suite_goal: ClassVar[tuple[float, float, float]]
 
-    def __init__(self, *, horizon: int = 250, **options: Any) -> None:
-        super().__init__(horizon=horizon, **options)
+    def __init__(self, *, horizon: int = 250, mask_scale: int = 2, **options: Any) -> None:
+        super().__init__(horizon=horizon, mask_scale=mask_scale, **options)
 
     def _load(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
         self._suite = self._suite_class()
@@ -161,6 +161,7 @@ class ShelfPlace(_MetaWorld):
 
     Args:
         horizon: Steps per episode.
+        mask_scale: A segmentation twice as fine as the images, against coarse positions (docs/results/benchmarks.md).
         options: See :class:`~torchrl_ocwm.envs.PositioningEnv`.
 
     Examples:
@@ -204,6 +205,7 @@ class PickPlace(_MetaWorld):
 
     Args:
         horizon: Steps per episode.
+        mask_scale: A segmentation twice as fine as the images, against coarse positions (docs/results/benchmarks.md).
         options: See :class:`~torchrl_ocwm.envs.PositioningEnv`.
 
     Examples:
