@@ -225,7 +225,7 @@ class CutUpdate:
         """The stepper zeroes the gradients before the backward pass, which is the same."""
         self.stepper.optimizer.step()
         self.stepper.target_updater.step()
-        self.stepper.optimizer.zero_grad(set_to_none=False)
+        self.stepper.optimizer.zero_grad()
 
 
 def _total(losses: TensorDictBase) -> Tensor:

@@ -88,12 +88,13 @@ class Size:
         model_lr: Learning rate of the world model.
         actor_lr: Learning rate of the actor.
         value_lr: Learning rate of the critic.
-        warmup: Updates until the learning rates are reached.
+        warmup: Updates until the learning rates are reached; 0 with ``optimizer="adam"``, which has none.
         gamma: Discount of a step in imagination.
         entropy_bonus: Weight of the actor's entropy.
         object_features: Features of an object latent, for object-centric world models.
         extractor_units: Units of the two layers that extract it.
         lambda_dynamic: Weight of the KL that trains the prior; that which trains the posterior has 0.1.
+        optimizer: ``"dreamer_v3"``, TorchRL's, or ``"adam"`` (:mod:`torchrl_ocwm.training.optimizer`).
     """
 
     style: Literal["dreamer_v3", "dreamer_v2"]
@@ -118,9 +119,12 @@ class Size:
     object_features: int = 256
     extractor_units: int = 512
     lambda_dynamic: float = 1.0
+    optimizer: Literal["dreamer_v3", "adam"] = "dreamer_v3"
 
     def __post_init__(self) -> None:
         check_choices(self)
+        if self.optimizer == "adam" and self.warmup:
+            raise ValueError(f"optimizer='adam' has no warm-up; set warmup=0, got {self.warmup}")
         for field in fields(self):
             value = getattr(self, field.name)
             if field.type == "int" and field.name != "warmup" and value < 1:

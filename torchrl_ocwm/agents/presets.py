@@ -41,8 +41,8 @@ SIZES = {
         style="dreamer_v2", cnn_depth=48, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=32,
         belief=200, hidden=200, gru_blocks=8,
         mlp_layers=4, mlp_units=400, batch_size=32, slice_len=32, imagination_horizon=15,
-        model_lr=3e-4, actor_lr=8e-5, value_lr=8e-5, warmup=1000, entropy_bonus=0.0, lambda_dynamic=0.5,
-        object_features=1536, extractor_units=512,
+        model_lr=3e-4, actor_lr=8e-5, value_lr=8e-5, warmup=0, entropy_bonus=0.0, lambda_dynamic=0.5,
+        object_features=1536, extractor_units=512, optimizer="adam",
     ),
     "large": Size(
         style="dreamer_v3", cnn_depth=64, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=64,

@@ -7,23 +7,11 @@ from tensordict import TensorDictBase
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torchrl.objectives import SoftUpdate
-from torchrl.trainers.algorithms import DreamerV3OptimizationStepper, DreamerV3Optimizer
+from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 
 from torchrl_ocwm.agents.agent import Agent
+from torchrl_ocwm.training.optimizer import make_optimizer
 from torchrl_ocwm.training.settings import Training
-
-
-def make_optimizer(agent: Agent) -> DreamerV3Optimizer:
-    """TorchRL's DreamerV3 optimiser with a learning rate each for model, actor and critic."""
-    loss, size = agent.loss, agent.size
-    groups = [
-        (loss.model_loss.parameters(), size.model_lr),
-        (loss.actor_loss.actor_model.parameters(), size.actor_lr),
-        (loss.value_loss.value_model_params.parameters(), size.value_lr),
-    ]
-    return DreamerV3Optimizer(
-        [{"params": list(parameters), "lr": rate} for parameters, rate in groups], warmup_steps=size.warmup
-    )
 
 
 def make_schedule(optimizer: Optimizer, training: Training) -> LambdaLR:
@@ -36,11 +24,12 @@ class Stepper(DreamerV3OptimizationStepper):
     """TorchRL's DreamerV3 stepper, which keeps mixed precision to GPUs; this one has it on CPUs too."""
 
     def _forward_backward(self, sample: TensorDictBase) -> TensorDictBase:
-        device = sample.get(self.loss_module.in_keys[0]).device.type
-        with torch.autocast(device, torch.bfloat16, enabled=self.mixed_precision):
+        device = sample.get(self.loss_module.in_keys[0]).device
+        with torch.autocast(device.type, torch.bfloat16, enabled=self.mixed_precision):
             losses = self.loss_module(sample)
         total = sum(value for key, value in losses.items() if isinstance(key, str) and key.startswith("loss_"))
-        self.optimizer.zero_grad(set_to_none=False)
+        # A graph needs gradients in the same place each time; without one, new tensors save a pass over each.
+        self.optimizer.zero_grad(set_to_none=not any(self.resolve(device)))
         total.backward()
         return losses.detach()
 
