@@ -11,7 +11,13 @@ AGENTS = {
     "dreamer_pcp": AgentConfig(goal="position", reward="position_distance", goal_source="uniform"),
     "focus": AgentConfig(world_model="object", observed=("proprio", "object_position", "goal_position")),
     "focus_pcp": AgentConfig(world_model="object", goal="position", reward="position_distance", goal_source="uniform"),
-    "focus_lcp": AgentConfig(world_model="object", goal="object_latent", reward="latent_chord", goal_source="uniform"),
+    "focus_lcp": AgentConfig(
+        world_model="object",
+        goal="object_latent",
+        reward="latent_chord",
+        goal_source="uniform",
+        lambda_positional=100.0,
+    ),
 }
 
 # fmt: off
