@@ -13,7 +13,6 @@ from torchrl_ocwm.modules import (
     InitialLatent,
     ObservationEncoder,
     PositionDistanceReward,
-    ProprioUnits,
     UniformGoals,
     WorkspaceUnits,
     position_distance,
@@ -36,22 +35,6 @@ class TestWorkspaceUnits:
     def test_empty_workspace(self) -> None:
         with pytest.raises(ValueError, match="low < high on every axis"):
             WorkspaceUnits((0.0, 0.0), (1.0, 0.0))
-
-
-class TestProprioUnits:
-    def test_data_get_mean_0_and_deviation_1(self) -> None:
-        units = ProprioUnits(3)
-        data = torch.randn(1000, 3) * torch.tensor([1e-3, 1.0, 40.0]) + torch.tensor([0.5, -2.0, 7.0])
-        torch.testing.assert_close(units(data), data)  # not measured yet
-        units.measure(data)
-        deviation, mean = torch.std_mean(units(data), 0, correction=0)
-        torch.testing.assert_close(mean, torch.zeros(3), atol=1e-4, rtol=0)
-        torch.testing.assert_close(deviation, torch.ones(3), atol=1e-3, rtol=0)
-
-    def test_a_value_that_never_changes_keeps_its_scale(self) -> None:
-        units = ProprioUnits(1)
-        units.measure(torch.full((7, 1), 0.3))
-        torch.testing.assert_close(units(torch.tensor([2.3])), torch.tensor([2.0]))
 
 
 class TestPositionDistance:

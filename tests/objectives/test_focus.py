@@ -219,11 +219,7 @@ def test_update_with_the_layers_of_the_paper(records: TensorDict, name: str) -> 
     agent = build_agent(name, reacher_task(), size)
     losses = agent.loss(records)
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
-    assert {part for part, child in agent.model.named_children() if not moved(child)} <= {
-        "two_hot",
-        "units",
-        "proprio_units",
-    }
+    assert {part for part, child in agent.model.named_children() if not moved(child)} <= {"two_hot", "units"}
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from torchrl.objectives import DreamerV3ModelLoss
 from torchrl_ocwm.objectives import WorldModelLoss
 from torchrl_ocwm.objectives.world_model import image_reconstruction, symlog_reconstruction
 
-VECTORS = ("proprio_units", "object_units", "goal_units")
+VECTORS = ("proprio", "object_units", "goal_units")
 
 
 def torchrl_loss(world_model: TensorDictModule) -> DreamerV3ModelLoss:
@@ -103,7 +103,7 @@ def test_set_keys_nested(make_agent: Any, records: TensorDict) -> None:
     model = make_agent("dreamer").model
     torch.manual_seed(1)
     expected, _ = WorldModelLoss(model.records())(records)
-    rename = TensorDictModule(nn.Identity(), [("next", "reco_proprio_units")], [("next", "predicted", "proprio")])
+    rename = TensorDictModule(nn.Identity(), [("next", "reco_proprio")], [("next", "predicted", "proprio")])
     moved = records.clone()
     moved["next", "reward_of", "task"] = moved["next"].pop("reward")
     loss = WorldModelLoss(TensorDictSequential(model.records(), rename))

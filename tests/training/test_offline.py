@@ -68,16 +68,6 @@ class TestResume:
         train(last, dataset, tmp_path / "parts")
         assert same(last, through)
 
-    def test_a_run_measures_proprioception_once(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
-        """And keeps its units when it goes on with other data."""
-        train(fresh(), dataset, tmp_path / "run")
-        deviation, mean = torch.std_mean(dataset.records["next", "proprio"], 0, correction=0)
-        other = random_dataset(tmp_path / "other", reacher_task(), episodes=3)
-        file = train(fresh(), other, tmp_path / "run", replace(SHORT, updates=14))
-        units = torchrl_ocwm.load_agent(file).agent.model.proprio_units
-        torch.testing.assert_close(units.mean, mean)
-        torch.testing.assert_close(units.deviation, deviation)
-
     def test_training_changes_everything(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         before, after = fresh(), fresh()
         train(after, dataset, tmp_path)

@@ -14,7 +14,7 @@ from torchrl_ocwm.modules.rewards import (
     PositionDistanceReward,
     position_distance,
 )
-from torchrl_ocwm.modules.units import ProprioUnits, WorkspaceUnits
+from torchrl_ocwm.modules.units import WorkspaceUnits
 from torchrl_ocwm.modules.world_model import FlatWorldModel, WorldModel
 
 __all__ = [
@@ -36,7 +36,6 @@ __all__ = [
     "ObservationEncoder",
     "PositionDistance",
     "PositionDistanceReward",
-    "ProprioUnits",
     "UniformGoals",
     "WorkspaceUnits",
     "WorldModel",

@@ -1,11 +1,9 @@
-"""Positions and proprioception inside the model: the units that make their errors count."""
+"""Positions inside the model: metres ↔ workspace units."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-
-_CONSTANT = 1e-6  # a standard deviation that is rounding
 
 
 class WorkspaceUnits(nn.Module):
@@ -59,39 +57,3 @@ class WorkspaceUnits(nn.Module):
     def to_metres(self, units: Tensor) -> Tensor:
         """Positions ``[..., D]`` in metres."""
         return units * self.metres_per_unit + (self.low + self.high) / 2
-
-
-class ProprioUnits(nn.Module):
-    """Shift and scale proprioception so that each value has mean 0 and standard deviation 1 in the data.
-
-    Metres, radians and radians per second weigh alike then: one centimetre of a hand is as much of its range as a fast
-    turn of a joint. Until :meth:`measure` has seen data, values stay as they are.
-
-    Args:
-        features: Number of values P.
-
-    Calling it turns ``[..., P]`` into units, float32.
-
-    Examples:
-        >>> units = ProprioUnits(2)
-        >>> units.measure(torch.tensor([[0.0, 5.0], [2.0, 5.0]]))
-        >>> units(torch.tensor([3.0, 5.0]))
-        tensor([2., 0.])
-    """
-
-    mean: Tensor
-    deviation: Tensor
-
-    def __init__(self, features: int) -> None:
-        super().__init__()
-        self.register_buffer("mean", torch.zeros(features))
-        self.register_buffer("deviation", torch.ones(features))
-
-    def measure(self, proprio: Tensor) -> None:
-        """Take mean and standard deviation from data ``[N, P]``; values that never change keep their scale."""
-        deviation, mean = torch.std_mean(proprio.double(), 0, correction=0)
-        self.mean.copy_(mean)
-        self.deviation.copy_(torch.where(deviation > _CONSTANT, deviation, 1.0))
-
-    def forward(self, proprio: Tensor) -> Tensor:
-        return (proprio - self.mean) / self.deviation

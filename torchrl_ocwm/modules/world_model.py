@@ -14,10 +14,10 @@ from torchrl.modules import RSSMRolloutV3, RSSMStateEstimatorV3, SymExpTwoHot
 from torchrl_ocwm.modules.latent import InitialLatent, LatentOfImages
 from torchrl_ocwm.modules.networks import Style, make_image_decoder, make_mlp, make_rssm
 from torchrl_ocwm.modules.observation import ObservationEncoder
-from torchrl_ocwm.modules.units import ProprioUnits, WorkspaceUnits
+from torchrl_ocwm.modules.units import WorkspaceUnits
 
 VectorName = Literal["proprio", "object_position", "goal_position"]
-_KEYS: dict[str, str] = {"proprio": "proprio_units", "object_position": "object_units", "goal_position": "goal_units"}
+_KEYS: dict[str, str] = {"proprio": "proprio", "object_position": "object_units", "goal_position": "goal_units"}
 
 
 class WorldModel(nn.Module, ABC):
@@ -74,7 +74,7 @@ class WorldModel(nn.Module, ABC):
     ) -> None:
         super().__init__()
         self.action, self.state, self.belief = action, categoricals * classes, belief
-        self.units, self.proprio_units, self.observed = units, ProprioUnits(proprio), tuple(observed)
+        self.units, self.observed = units, tuple(observed)
         sizes = {"proprio": proprio, "object_position": objects * units.dim, "goal_position": units.dim}
         vectors = {name: sizes[name] for name in self.observed}
         mlp = {"layers": mlp_layers, "units": mlp_units}
@@ -151,17 +151,15 @@ class WorldModel(nn.Module, ABC):
         """Decoded object positions ``object_units`` ``[..., O * D]`` of imagined latents, in workspace units."""
 
     def vectors(self, *at: str) -> list[TensorDictModuleBase]:
-        """Predictions of the observed vectors, ``reco_proprio_units``, …, from the latent at a place."""
+        """Predictions of the observed vectors from the latent at a place: ``reco_proprio``, …, ``reco_goal_units``."""
         return [
             TensorDictModule(decoder, latent_at(at), [key_at(at, f"reco_{_KEYS[name]}")])
             for name, decoder in self.vector_decoders.items()
         ]
 
     def _encode(self, *at: str) -> list[TensorDictModuleBase]:
-        """What is observed to units of the model, then to ``encoded_latents``."""
+        """Positions to workspace units, then all that is observed to ``encoded_latents``."""
         modules: list[TensorDictModuleBase] = []
-        if "proprio" in self.observed:
-            modules.append(TensorDictModule(self.proprio_units, [key_at(at, "proprio")], [key_at(at, "proprio_units")]))
         if "object_position" in self.observed:
             flatten = _ObjectUnits(self.units)
             modules.append(TensorDictModule(flatten, [key_at(at, "object_position")], [key_at(at, "object_units")]))

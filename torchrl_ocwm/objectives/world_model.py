@@ -61,8 +61,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
         lambda_dynamic: Weight of the KL that trains the prior.
         lambda_representation: Weight of the KL that trains the posterior.
         lambda_pixels: Weight of the image, squared error in [0, 1] summed over pixels.
-        lambda_proprio: Weight of proprioception, squared error in symlog space summed over the vector, in units of its
-            deviation (:class:`~torchrl_ocwm.modules.ProprioUnits`).
+        lambda_proprio: Weight of proprioception, squared error in symlog space summed over the vector.
         lambda_object_position: Weight of the object positions, likewise, in workspace units.
         lambda_goal_position: Weight of the goal position, likewise.
         lambda_reward: Weight of the reward, two-hot cross-entropy.
@@ -96,9 +95,8 @@ class WorldModelLoss(DreamerV3ModelLoss):
             posterior_logits (NestedKey): Defaults to ``"posterior_logits"``.
             pixels (NestedKey): Image in the records. Defaults to ``"pixels"``.
             reco_pixels (NestedKey): Predicted image. Defaults to ``"reco_pixels"``.
-            proprio (NestedKey): Proprioception, ``[B, T, P]`` in units of its deviation. Defaults to
-                ``"proprio_units"``.
-            reco_proprio (NestedKey): Its prediction. Defaults to ``"reco_proprio_units"``.
+            proprio (NestedKey): Proprioception in the records. Defaults to ``"proprio"``.
+            reco_proprio (NestedKey): Its prediction. Defaults to ``"reco_proprio"``.
             object_position (NestedKey): Object positions, ``[B, T, O * D]`` in workspace units. Defaults to
                 ``"object_units"``.
             reco_object_position (NestedKey): Their prediction. Defaults to ``"reco_object_units"``.
@@ -110,8 +108,8 @@ class WorldModelLoss(DreamerV3ModelLoss):
             done (NestedKey): Not used; TorchRL's loss has it.
         """
 
-        proprio: NestedKey = "proprio_units"
-        reco_proprio: NestedKey = "reco_proprio_units"
+        proprio: NestedKey = "proprio"
+        reco_proprio: NestedKey = "reco_proprio"
         object_position: NestedKey = "object_units"
         reco_object_position: NestedKey = "reco_object_units"
         goal_position: NestedKey = "goal_units"
@@ -156,7 +154,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
     def targets(self) -> list[NestedKey]:
         """What the losses compare predictions with."""
         keys = self.tensor_keys
-        return [unravel_key(("next", key)) for key in (keys.pixels, keys.reward, keys.terminated)]
+        return [unravel_key(("next", key)) for key in (keys.pixels, keys.proprio, keys.reward, keys.terminated)]
 
     def forward(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Losses of records ``[B, T]``, scalars, and the records with the predictions."""

@@ -21,7 +21,6 @@ from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_schedule, make_stepper
 
 CHECKPOINT = "checkpoint.zip"
-_MEASURED = 100_000  # frames
 _SHOWN = ("loss_model_pixels", "loss_model_object_position", "loss_actor", "loss_value")
 
 
@@ -62,8 +61,6 @@ def train_offline(
     _check_task(agent, dataset)
     if file.exists():
         check_same_agent(agent, file)
-    else:
-        _measure(agent, dataset)
     if training.threads:
         torch.set_num_threads(training.threads)
     torch.manual_seed(training.seed)
@@ -121,12 +118,6 @@ def _make_trainer(
         save_trainer_file=file,
         checkpoint=RunCheckpoint(format="archive", agent=describe(agent), rng=GlobalRNGState()),
     )
-
-
-def _measure(agent: Agent, dataset: EpisodeDataset) -> None:
-    """Fit the units of proprioception to the data."""
-    proprio = dataset.records["next", "proprio"]
-    agent.model.proprio_units.measure(proprio[:: max(1, len(proprio) // _MEASURED)])
 
 
 class RunCheckpoint(Checkpoint):
