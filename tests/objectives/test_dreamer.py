@@ -205,16 +205,3 @@ def test_in_keys_suffice(make_agent: Any, records: TensorDict) -> None:
     torch.manual_seed(1)
     got = loss(records.select(*loss.in_keys))
     torch.testing.assert_close(total(got), total(expected))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["dreamer", "dreamer_pcp"])
-@pytest.mark.usefixtures("no_noise")
-def test_update_compiles_into_one_graph(make_agent: Any, records: TensorDict, name: str) -> None:
-    """Without graph breaks, and with the same losses."""
-    records = records[:, :3]
-    expected = make_agent(name).loss(records)
-    loss = make_agent(name).loss
-    losses = torch.compile(lambda batch: loss(batch), fullgraph=True, backend="eager")(records)
-    for key in expected.keys(True, True):
-        torch.testing.assert_close(losses[key], expected[key], msg=str(key))

@@ -220,14 +220,3 @@ def test_update_with_the_layers_of_the_paper(records: TensorDict, name: str) -> 
     losses = agent.loss(records)
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     assert {part for part, child in agent.model.named_children() if not moved(child)} <= {"two_hot", "units"}
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("no_noise")
-def test_update_of_lcp_compiles_into_one_graph(make_agent: Any, records: TensorDict) -> None:
-    records = records[:, :3]
-    expected = make_agent("focus_lcp", goal_source="mixed").loss(records)
-    loss = make_agent("focus_lcp", goal_source="mixed").loss
-    losses = torch.compile(lambda batch: loss(batch), fullgraph=True, backend="eager")(records)
-    for key in expected.keys(True, True):
-        torch.testing.assert_close(losses[key], expected[key], msg=str(key))

@@ -1,13 +1,15 @@
 """One update: mixed precision and learning rates."""
 
+from typing import Any
+
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from torchrl_ocwm.agents import build_agent
 from torchrl_ocwm.testing import random_records, reacher_task
 from torchrl_ocwm.training.settings import Training
-from torchrl_ocwm.training.stepper import make_schedule, make_stepper
+from torchrl_ocwm.training.stepper import make_schedule, make_stepper, one_graph
 
 
 def first_update(mixed_precision: bool) -> tuple[TensorDictBase, list[torch.dtype], list[torch.dtype]]:
@@ -30,6 +32,28 @@ def test_mixed_precision_works_on_a_cpu() -> None:
     for name in ("loss_model_object_position", "loss_model_masks", "loss_model_image_latent"):
         assert mixed[name] != single[name]
         torch.testing.assert_close(mixed[name].float(), single[name], rtol=0.02, atol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "changes"), [("dreamer", {}), ("dreamer_pcp", {}), ("focus_lcp", {"goal_source": "mixed"})]
+)
+@pytest.mark.usefixtures("no_noise")
+def test_update_compiles_into_one_graph(make_agent: Any, records: TensorDict, name: str, changes: dict) -> None:
+    """Forward and backward without a graph break, to the same losses and gradients."""
+    records, results = records[:, :3], []
+    for compiled in (False, True):
+        agent = make_agent(name, **changes)
+        step = make_stepper(agent, Training())._forward_backward
+        with one_graph():
+            losses = torch.compile(step, fullgraph=True, backend="eager")(records) if compiled else step(records)
+        results.append((losses, {key: p.grad for key, p in agent.named_parameters() if p.grad is not None}))
+    (expected, gradients), (losses, traced) = results
+    for key in expected.keys(True, True):
+        torch.testing.assert_close(losses[key], expected[key], msg=str(key))
+    assert traced.keys() == gradients.keys()
+    for key, gradient in gradients.items():
+        torch.testing.assert_close(traced[key], gradient, rtol=1e-4, atol=1e-5, msg=str(key))
 
 
 def rates(training: Training, state: dict | None = None) -> tuple[list[float], dict]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
+
 import torch
 from tensordict import TensorDictBase
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torchrl.objectives import SoftUpdate
+from torchrl.trainers import Trainer
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 
 from torchrl_ocwm.agents.agent import Agent
@@ -20,18 +23,33 @@ def make_schedule(optimizer: Optimizer, training: Training) -> LambdaLR:
     return LambdaLR(optimizer, lambda update: 1 - (1 - training.final_lr) * min(update / training.updates, 1))
 
 
+def one_graph() -> AbstractContextManager[None]:
+    """Let ``torch.compile`` trace a backward pass together with what it differentiates, where it knows how to."""
+    dynamo = torch._dynamo.config
+    known = hasattr(dynamo, "trace_autograd_ops")  # since PyTorch 2.12
+    return dynamo.patch(trace_autograd_ops=True) if known else nullcontext()
+
+
 class Stepper(DreamerV3OptimizationStepper):
-    """TorchRL's DreamerV3 stepper, which keeps mixed precision to GPUs; this one has it on CPUs too."""
+    """TorchRL's DreamerV3 stepper with mixed precision on CPUs too, and nothing in the step that breaks its graph."""
 
     def _forward_backward(self, sample: TensorDictBase) -> TensorDictBase:
-        device = sample.get(self.loss_module.in_keys[0]).device
-        with torch.autocast(device.type, torch.bfloat16, enabled=self.mixed_precision):
+        device = sample.get(self.loss_module.tensor_keys.is_init).device.type
+        with torch.autocast(device, torch.bfloat16, enabled=self.mixed_precision):
             losses = self.loss_module(sample)
-        total = sum(value for key, value in losses.items() if isinstance(key, str) and key.startswith("loss_"))
-        # A graph needs gradients in the same place each time; without one, new tensors save a pass over each.
-        self.optimizer.zero_grad(set_to_none=not any(self.resolve(device)))
-        total.backward()
+        sum(value for key, value in losses.items() if isinstance(key, str) and key.startswith("loss_")).backward()
         return losses.detach()
+
+    def warmup(self, sample: TensorDictBase) -> None:
+        """Compile or capture the step on representative data; nothing is trained."""
+        with one_graph():
+            super().warmup(sample)
+
+    def step(self, trainer: Trainer | None, sub_batch: TensorDictBase) -> TensorDictBase:
+        """Update model, actor, critic and slow critic; returns detached metrics."""
+        # A graph needs gradients in the same place each time; without one, new tensors save a pass over each.
+        self.optimizer.zero_grad(set_to_none=not any(self.resolve(sub_batch.get("action").device)))
+        return super().step(trainer, sub_batch)
 
 
 def make_stepper(agent: Agent, training: Training) -> DreamerV3OptimizationStepper:
