@@ -81,8 +81,7 @@ class CubeMove(PositioningEnv):
         objects: ``("cube",)``, or ``("cube", "distractor")`` for a second, blue cube that starts within 15 cm of the
             middle of the table.
         horizon: Steps per episode.
-        mask_scale: Positions from a segmentation twice as fine as the images halve their error at no cost that could
-            be measured (docs/results/benchmarks.md).
+        mask_scale: A segmentation so much finer than the images, for exact positions (docs/results/benchmarks.md).
         options: See :class:`~torchrl_ocwm.envs.PositioningEnv`.
 
     Raises:
@@ -119,7 +118,7 @@ class CubeMove(PositioningEnv):
     depth_offset = 0.013  # no bias on average over positions and turns of the cube, at 64 x 64 and at 256 x 256
 
     def __init__(
-        self, *, objects: Sequence[str] = ("cube",), horizon: int = 250, mask_scale: int = 2, **options: Any
+        self, *, objects: Sequence[str] = ("cube",), horizon: int = 250, mask_scale: int = 3, **options: Any
     ) -> None:
         if tuple(objects) not in (("cube",), ("cube", "distractor")):
             raise ValueError(f"objects must be ('cube',) or ('cube', 'distractor'), got {tuple(objects)}")
