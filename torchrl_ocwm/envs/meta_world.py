@@ -48,8 +48,8 @@ class _MetaWorld(PositioningEnv):
     #: Where Meta-World's own goal is at a reset, metres; it places the shelf.
     _suite_goal: ClassVar[tuple[float, float, float]]
 
-    def __init__(self, *, horizon: int = 250, mask_scale: int = 3, **options: Any) -> None:
-        super().__init__(horizon=horizon, mask_scale=mask_scale, **options)
+    def __init__(self, *, horizon: int = 250, **options: Any) -> None:
+        super().__init__(horizon=horizon, **options)
 
     def _load(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
         self._suite = self._suite_class()
@@ -161,7 +161,6 @@ class ShelfPlace(_MetaWorld):
 
     Args:
         horizon: Steps per episode.
-        mask_scale: A segmentation so much finer than the images, for exact positions (docs/results/benchmarks.md).
         options: See :class:`~torchrl_ocwm.envs.PositioningEnv`.
 
     Examples:
@@ -205,7 +204,6 @@ class PickPlace(_MetaWorld):
 
     Args:
         horizon: Steps per episode.
-        mask_scale: A segmentation so much finer than the images, for exact positions (docs/results/benchmarks.md).
         options: See :class:`~torchrl_ocwm.envs.PositioningEnv`.
 
     Examples:
