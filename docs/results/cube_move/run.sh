@@ -3,10 +3,11 @@
 # what they did. Dreamer trains on the same data. One thread each, two runs at a time. Run from the repository root; what
 # is done already is not done again.
 # Images of 32 x 32: an update takes half the time of one with 64 x 64, and the imagined cube goes astray no more.
-# On a GPU: SIZE=paper IMAGE=64 FINER=3 UPDATES=50000 STEPS=300000 GOALS=100 DEVICE=cuda docs/results/cube_move/run.sh
+# On a GPU: SIZE=paper IMAGE=64 FINER=3 UPDATES=50000 STEPS=300000 ROUNDS=8 GOALS=100 DEVICE=cuda \
+#   docs/results/cube_move/run.sh
 set -eu
 export MUJOCO_GL=${MUJOCO_GL:-egl} LP_NUM_THREADS=0
-size=${SIZE:-cpu} updates=${UPDATES:-4000} steps=${STEPS:-32000} rounds=${ROUNDS:-8} device=${DEVICE:-cpu}
+size=${SIZE:-cpu} updates=${UPDATES:-5000} steps=${STEPS:-28000} rounds=${ROUNDS:-4} device=${DEVICE:-cpu}
 image=${IMAGE:-32} finer=${FINER:-5}  # pixels, and how many times finer the segmentation is
 here=docs/results/cube_move runs=outputs/cube_move data=data/cube_move
 
