@@ -261,7 +261,7 @@ def measure_whole(batch: TensorDictBase, arguments: argparse.Namespace) -> dict[
         stepper.warmup(batch)
 
     def step() -> None:
-        stepper.step(None, batch.copy())  # it adds a key, and what is compiled would be compiled again for that
+        stepper.step(None, batch.copy())  # it adds a key, which a fresh sample lacks
 
     step()
 
