@@ -2,7 +2,7 @@
 # What docs/results/cube_move shows: scripted and random data first; then, in rounds, two agents train, act, and train on
 # what they did. Dreamer trains on the same data. One thread each, two runs at a time. Run from the repository root; what
 # is done already is not done again.
-# Images of 32 x 32: an update takes half the time of one with 64 x 64, and the imagined cube goes astray no more.
+# Small images make updates cheap.
 # On a GPU: SIZE=paper IMAGE=64 FINER=3 UPDATES=50000 STEPS=300000 ROUNDS=8 GOALS=100 DEVICE=cuda \
 #   docs/results/cube_move/run.sh
 set -eu
@@ -41,7 +41,10 @@ train dreamer $((updates + rounds * updates / 2)) 0.1
 for agent in dreamer focus_pcp focus_lcp; do
   cp "$(run $agent)/.hydra/config.yaml" $here/${agent}_seed_0.yaml
   cp "$(run $agent)/log/scalars/evaluation/final_score.csv" $here/${agent}_seed_0.csv
+  cp "$(run $agent)/log/scalars/return_high.csv" $here/${agent}_seed_0_imagined_return.csv
 done
-python examples/diagnose.py checkpoint="$(run focus_lcp)/checkpoint.zip" dataset=$data output=$here/diagnosis
-python examples/evaluate.py goals=${GOALS:-36} image_goals=true episode_steps=100 workers=0 envs=18 output=$here \
+python examples/diagnose.py checkpoint="$(run focus_lcp)/checkpoint.zip" dataset=$data \
+  output=$here/diagnosis hydra.output_subdir=null
+python examples/evaluate.py goals=${GOALS:-36} image_goals=true episode_steps=100 workers=0 envs=18 \
+  output=$here hydra.output_subdir=null \
   "checkpoint=[$(run dreamer)/checkpoint.zip,$(run focus_pcp)/checkpoint.zip,$(run focus_lcp)/checkpoint.zip]"
