@@ -15,7 +15,7 @@ from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.evaluation import LandmarkEvaluation
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm
-from torchrl_ocwm.training.config import recipe, to_dataclass
+from torchrl_ocwm.training.config import keep_config, recipe, to_dataclass
 from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.settings import Training
 
@@ -26,6 +26,8 @@ def main(config: DictConfig) -> None:
     dataset = EpisodeDataset.open(config.dataset)
     if dataset.metadata.get("environment") != config.env.name:
         raise DatasetError(f"{dataset.path}: holds {dataset.metadata.get('environment')}, not env={config.env.name}")
+    config.env.options = dataset.metadata["options"]  # whatever the command line says: these are what is trained on
+    keep_config(config)
     torch.manual_seed(training.seed)
     agent = build_agent(
         to_dataclass(AgentConfig, config.agent),

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 import torchrl_ocwm
 
@@ -50,7 +51,9 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     files.append(train(dataset, tmp_path / "lcp", "agent=focus_lcp"))
     assert (tmp_path / "pcp" / "videos" / "open_loop_0000004.mp4").stat().st_size > 1000
     assert list((tmp_path / "pcp" / "tensorboard").iterdir())
-    assert (tmp_path / "pcp" / ".hydra" / "config.yaml").exists()
+    kept = OmegaConf.load(tmp_path / "pcp" / ".hydra" / "config.yaml")
+    assert kept.env.options.horizon == 30  # the dataset's, where the command has the default
+    assert (kept.training.updates, kept.agent.reward) == (4, "position_distance")
     checkpoints = ",".join(map(str, files))
     output = tmp_path / "evaluation"
     printed = run(

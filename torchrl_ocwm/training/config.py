@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import CheckpointError
@@ -83,6 +84,13 @@ def _compose(valid: DictConfig, name: str, override: str) -> None:
         node = OmegaConf.select(valid, parent) if parent else valid
         keys = ", ".join(f"{parent}.{one}" if parent else f"{one!s}" for one in map(str, node))
         sys.exit(f"ConfigError: unknown key {key!r}; valid here: {keys}")
+
+
+def keep_config(config: DictConfig) -> None:
+    """Put a configuration in place of what Hydra wrote before the script began, which may know less."""
+    hydra_config = HydraConfig.get()
+    if hydra_config.output_subdir is not None:
+        OmegaConf.save(config, Path(hydra_config.runtime.output_dir) / hydra_config.output_subdir / "config.yaml")
 
 
 def to_dataclass(kind: type[T], config: DictConfig) -> T:
