@@ -261,7 +261,7 @@ def measure_whole(batch: TensorDictBase, arguments: argparse.Namespace) -> dict[
         stepper.warmup(batch)
 
     def step() -> None:
-        stepper.step(None, batch.copy())  # it adds a key, which a fresh sample lacks
+        stepper.step(None, batch.copy())  # it adds a key, and an update is compiled anew for that
 
     step()
 

@@ -148,6 +148,7 @@ class GivenGoals(TensorDictModuleBase):
         self.in_keys, self.out_keys = ["goal_position"], [goal_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the goal: that of the position, or that of the image where there is none or it is NaN."""
         given = tensordict.get("goal", None)
         position = tensordict.get("goal_position") if given is None else given.get("position", None)
         pixels = None if given is None else given.get("pixels", None)

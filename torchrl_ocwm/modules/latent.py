@@ -77,6 +77,7 @@ class LatentOfImages(nn.Module):
         self.estimator = RSSMStateEstimatorV3(prior, posterior)
 
     def forward(self, embeddings: Tensor) -> tuple[Tensor, Tensor]:
+        """State and belief after the last image."""
         shape = embeddings.shape[:-2]
         embeddings = embeddings.reshape(-1, *embeddings.shape[-2:])  # a GRU takes one batch dimension
         count = embeddings.shape[:1]

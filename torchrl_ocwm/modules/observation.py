@@ -55,6 +55,7 @@ class ObservationEncoder(nn.Module):
             self.features += mlp_units
 
     def forward(self, pixels: Tensor, *vectors: Tensor) -> Tensor:
+        """The embedding of an image and vectors."""
         self._check(pixels, vectors)
         image = self.cnn(pixels)
         if self.mlp is None:
