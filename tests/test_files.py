@@ -1,0 +1,60 @@
+"""Files are replaced whole; folders have one writer."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from torchrl_ocwm.files import FolderInUseError, only_writer, replacing
+
+
+def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    file.write_text("old")
+
+    def half() -> None:
+        with replacing(file) as new:
+            new.write_text("half")
+            raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        half()
+    assert file.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_contents_reach_the_disk_before_the_name_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda descriptor: (calls.append("fsync"), fsync(descriptor)))
+    monkeypatch.setattr(os, "replace", lambda *paths: (calls.append("replace"), replace(*paths)))
+    with replacing(tmp_path / "a.txt") as new:
+        new.write_text("whole")
+    assert calls == ["fsync", "replace", "fsync"]
+
+
+_HOLD = """
+import sys, time
+from torchrl_ocwm.files import only_writer
+with only_writer(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_the_second_writer_is_refused_until_the_first_is_dead(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", _HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True) as first:
+        assert first.stdout is not None
+        assert first.stdout.readline() == "held\n"
+        try:
+            with pytest.raises(FolderInUseError, match=str(first.pid)), only_writer(tmp_path):
+                pass
+        finally:
+            first.kill()
+        first.wait()
+        with only_writer(tmp_path):
+            assert (tmp_path / ".lock_owner").read_text() == str(os.getpid())

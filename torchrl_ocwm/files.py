@@ -1,0 +1,95 @@
+"""Files that are whole at any moment, and folders that one process at a time writes to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+_LOCK, _OWNER = ".lock", ".lock_owner"
+
+
+class FolderInUseError(RuntimeError):
+    """Another process writes to the folder; the message names both."""
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Write a file beside the one that it replaces, and put it in its place in one step when it is whole.
+
+    A process that is killed, a full disk or a power cut leaves the old file or the new one, never a part.
+
+    Args:
+        path: The file. What is written goes to the path that is yielded, in the same folder.
+
+    Raises:
+        OSError: if it cannot be written; the old file is then as it was.
+
+    Examples:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp()) / "a.txt"
+        >>> with replacing(file) as new:
+        ...     _ = new.write_text("whole")
+        >>> file.read_text(), len(list(file.parent.iterdir()))
+        ('whole', 1)
+    """
+    path = Path(path)
+    new = path.with_name(f".{path.stem}.new{path.suffix}")
+    try:
+        yield new
+        sync(new)
+        os.replace(new, path)
+    except BaseException:
+        new.unlink(missing_ok=True)
+        raise
+    sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's contents, or a folder's entries, are on the disk."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        if path.is_dir():
+            return  # Windows opens no folders, and keeps their entries by itself
+        raise
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def only_writer(folder: str | Path) -> Iterator[None]:
+    """Be the only process that writes to a folder; a process that dies gives it back.
+
+    Args:
+        folder: The folder, which exists.
+
+    Raises:
+        FolderInUseError: if another process has it, with its process id.
+
+    Examples:
+        >>> import tempfile
+        >>> with only_writer(tempfile.mkdtemp()):
+        ...     pass
+    """
+    folder = Path(folder)
+    owner = folder / _OWNER
+    lock = FileLock(folder / _LOCK, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        who = owner.read_text() if owner.exists() else "unknown"
+        raise FolderInUseError(
+            f"{folder}: process {who} is writing here; wait until it has ended, or choose another folder"
+        ) from None
+    try:
+        owner.write_text(str(os.getpid()))
+        yield
+    finally:
+        owner.unlink(missing_ok=True)
+        lock.release()
