@@ -1,9 +1,63 @@
-"""Which agents there are: rows of choices, and the builder that wires them."""
+"""Which agents there are: parts with settings, rows of them, and the builder that wires them."""
 
 from torchrl_ocwm.agents.agent import Agent, Policy
+from torchrl_ocwm.agents.behaviour import LearntBehaviour
 from torchrl_ocwm.agents.build import build_agent
 from torchrl_ocwm.agents.checkpoint import load_agent
-from torchrl_ocwm.agents.config import AgentConfig, Size
+from torchrl_ocwm.agents.config import AgentConfig, Behaviour, Learning, Size
+from torchrl_ocwm.agents.goal_sources import EnvironmentGoals, FrameGoalSource, GoalSource, MixedGoalSource, UniformGoalSource
+from torchrl_ocwm.agents.goals import Goal, GoalEncoding, NoGoal, ObjectLatent, Position
+from torchrl_ocwm.agents.optimizers import Adam, DreamerV3, OptimizerPart
 from torchrl_ocwm.agents.presets import AGENTS, SIZES, agent_name
+from torchrl_ocwm.agents.rewards import (
+    ImaginedReward,
+    LatentChord,
+    LatentSimilarity,
+    LearnedReward,
+    PositionDistance,
+    Reward,
+)
+from torchrl_ocwm.agents.scene import Scene
+from torchrl_ocwm.agents.world_models import Flat, ObjectCentric, WorldModelPart
+from torchrl_ocwm.modules.architecture import Architecture
+from torchrl_ocwm.parts import register
 
-__all__ = ["AGENTS", "SIZES", "Agent", "AgentConfig", "Policy", "Size", "agent_name", "build_agent", "load_agent"]
+__all__ = [
+    "AGENTS",
+    "SIZES",
+    "Adam",
+    "Agent",
+    "AgentConfig",
+    "Architecture",
+    "Behaviour",
+    "DreamerV3",
+    "EnvironmentGoals",
+    "Flat",
+    "FrameGoalSource",
+    "Goal",
+    "GoalEncoding",
+    "GoalSource",
+    "ImaginedReward",
+    "LatentChord",
+    "LatentSimilarity",
+    "LearnedReward",
+    "Learning",
+    "LearntBehaviour",
+    "MixedGoalSource",
+    "NoGoal",
+    "ObjectCentric",
+    "ObjectLatent",
+    "OptimizerPart",
+    "Policy",
+    "Position",
+    "PositionDistance",
+    "Reward",
+    "Scene",
+    "Size",
+    "UniformGoalSource",
+    "WorldModelPart",
+    "agent_name",
+    "build_agent",
+    "load_agent",
+    "register",
+]

@@ -9,6 +9,7 @@ from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.config import AgentConfig, Size
 from torchrl_ocwm.agents.presets import AGENTS, SIZES
 from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.parts import load_plugins
 
 T = TypeVar("T")
 
@@ -27,8 +28,8 @@ def build_agent(agent: str | AgentConfig, task: Task, size: str | Size = "cpu") 
     Examples:
         >>> from torchrl_ocwm.testing import reacher_task
         >>> agent = build_agent("dreamer_pcp", reacher_task(), size="debug")
-        >>> agent.config.reward
-        'position_distance'
+        >>> agent.config.behaviours["reach"].reward
+        PositionDistance()
     """
     return Agent(task, _by_name(agent, AGENTS, "agent"), _by_name(size, SIZES, "size"))
 
@@ -36,6 +37,8 @@ def build_agent(agent: str | AgentConfig, task: Task, size: str | Size = "cpu") 
 def _by_name(choice: str | T, choices: Mapping[str, T], what: str) -> T:
     if not isinstance(choice, str):
         return choice
+    if choice not in choices:
+        load_plugins()
     if choice not in choices:
         raise ValueError(f"unknown {what} {choice!r}; there are {', '.join(choices)}")
     return choices[choice]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, asdict, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torchrl.checkpoint import Checkpoint, CheckpointError
@@ -12,18 +11,22 @@ from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl_ocwm.agents.agent import Agent, Policy
 from torchrl_ocwm.agents.config import AgentConfig, Size
 from torchrl_ocwm.envs.task import Task
-
-T = TypeVar("T")
+from torchrl_ocwm.settings import from_dict, to_dict
 
 
 def describe(agent: Agent) -> dict[str, Any]:
     """What it takes to build an agent again; fits in JSON."""
-    return {"agent": asdict(agent.config), "size": asdict(agent.size), "task": agent.task.to_dict()}
+    return {"agent": to_dict(agent.config), "size": to_dict(agent.size), "task": agent.task.to_dict()}
 
 
 def rebuild(description: dict[str, Any]) -> Agent:
-    """An agent with fresh weights from what :func:`describe` gave."""
-    config, size = _dataclass(AgentConfig, description["agent"]), _dataclass(Size, description["size"])
+    """An agent with fresh weights from what :func:`describe` gave; only registered parts are ever built.
+
+    Raises:
+        SettingsError: if a part or a setting is unknown here.
+    """
+    config = from_dict(AgentConfig, description["agent"], "agent")
+    size = from_dict(Size, description["size"], "size")
     return Agent(Task.from_dict(description["task"]), config, size)
 
 
@@ -89,13 +92,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
-
-
-def _dataclass(kind: type[T], values: dict[str, Any]) -> T:
-    known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
-    # A setting that a later release adds has the default that was the rule before.
-    needed = {name for name, field in known.items() if field.default is MISSING}
-    odd = sorted((set(values) - set(known)) | (needed - set(values)))
-    if odd:
-        raise CheckpointError(f"the checkpoint is of another release: {kind.__name__} differs in {odd}")
-    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})

@@ -2,60 +2,81 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Mapping
+from typing import Any
 
-from torchrl_ocwm.agents.config import AgentConfig, Size
+from torchrl_ocwm.agents.config import REACH, AgentConfig, Behaviour, Learning, Size
+from torchrl_ocwm.agents.goal_sources import UniformGoalSource
+from torchrl_ocwm.agents.goals import ObjectLatent, Position
+from torchrl_ocwm.agents.optimizers import Adam, DreamerV3
+from torchrl_ocwm.agents.rewards import LatentChord, PositionDistance
+from torchrl_ocwm.agents.world_models import Flat, ObjectCentric
+from torchrl_ocwm.modules.architecture import Architecture
+from torchrl_ocwm.settings import to_dict
 
+_WITH_GOAL = ("proprio", "object_position", "goal_position")
+_PCP = Behaviour(goal=Position(), reward=PositionDistance(), goals=UniformGoalSource())
+_LCP = Behaviour(goal=ObjectLatent(weight=100.0), reward=LatentChord(), goals=UniformGoalSource())
+
+#: The rows. Add one of your own under a new name, and it can be built, trained and loaded by it.
 AGENTS = {
-    "dreamer": AgentConfig(observed=("proprio", "object_position", "goal_position")),
-    "dreamer_pcp": AgentConfig(goal="position", reward="position_distance", goal_source="uniform"),
-    "focus": AgentConfig(world_model="object", observed=("proprio", "object_position", "goal_position")),
-    "focus_pcp": AgentConfig(world_model="object", goal="position", reward="position_distance", goal_source="uniform"),
-    "focus_lcp": AgentConfig(
-        world_model="object",
-        goal="object_latent",
-        reward="latent_chord",
-        goal_source="uniform",
-        lambda_positional=100.0,
-    ),
+    "dreamer": AgentConfig(Flat(observed=_WITH_GOAL)),
+    "dreamer_pcp": AgentConfig(Flat(), {REACH: _PCP}),
+    "focus": AgentConfig(ObjectCentric(observed=_WITH_GOAL)),
+    "focus_pcp": AgentConfig(ObjectCentric(), {REACH: _PCP}),
+    "focus_lcp": AgentConfig(ObjectCentric(), {REACH: _LCP}),
 }
 
 # fmt: off
 SIZES = {
     "debug": Size(
-        style="dreamer_v3", cnn_depth=2, cnn_mults=(1, 2, 2, 2), categoricals=4, classes=4,
-        belief=16, hidden=16, gru_blocks=2,
-        mlp_layers=1, mlp_units=16, batch_size=2, slice_len=8, imagination_horizon=3,
-        model_lr=1e-3, actor_lr=1e-3, value_lr=1e-3, warmup=0,
-        object_features=16, extractor_units=16,
+        Architecture(
+            cnn_depth=2, cnn_mults=(1, 2, 2, 2), categoricals=4, classes=4, belief=16, hidden=16, gru_blocks=2,
+            mlp_layers=1, mlp_units=16, object_features=16, extractor_units=16,
+        ),
+        Learning(
+            batch_size=2, slice_len=8, imagination_horizon=3, model_lr=1e-3, actor_lr=1e-3, value_lr=1e-3,
+        ),
     ),
     "cpu": Size(
-        style="dreamer_v3", cnn_depth=8, cnn_mults=(1, 2, 4, 4), categoricals=16, classes=16,
-        belief=128, hidden=128, gru_blocks=8,
-        mlp_layers=2, mlp_units=128, batch_size=8, slice_len=16, imagination_horizon=10,
-        model_lr=1e-3, actor_lr=1e-3, value_lr=1e-3, warmup=100, gamma=0.95,
-        object_features=128, extractor_units=128,
+        Architecture(
+            cnn_depth=8, cnn_mults=(1, 2, 4, 4), categoricals=16, classes=16, belief=128, hidden=128,
+            mlp_layers=2, mlp_units=128, object_features=128, extractor_units=128,
+        ),
+        Learning(
+            batch_size=8, slice_len=16, imagination_horizon=10, model_lr=1e-3, actor_lr=1e-3, value_lr=1e-3,
+            gamma=0.95, optimizer=DreamerV3(warmup=100),
+        ),
     ),
     "small": Size(
-        style="dreamer_v3", cnn_depth=24, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=16,
-        belief=512, hidden=256, gru_blocks=8,
-        mlp_layers=3, mlp_units=256, batch_size=16, slice_len=32, imagination_horizon=15,
-        model_lr=3e-4, actor_lr=1e-4, value_lr=1e-4, warmup=500,
-        object_features=512, extractor_units=256,
+        Architecture(
+            cnn_depth=24, categoricals=32, classes=16, belief=512, hidden=256,
+            mlp_layers=3, mlp_units=256, object_features=512, extractor_units=256,
+        ),
+        Learning(
+            batch_size=16, slice_len=32, imagination_horizon=15, model_lr=3e-4, actor_lr=1e-4, value_lr=1e-4,
+            optimizer=DreamerV3(warmup=500),
+        ),
     ),
     "paper": Size(
-        style="dreamer_v2", cnn_depth=48, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=32,
-        belief=200, hidden=200, gru_blocks=8,
-        mlp_layers=4, mlp_units=400, batch_size=32, slice_len=32, imagination_horizon=15,
-        model_lr=3e-4, actor_lr=8e-5, value_lr=8e-5, warmup=0, entropy_bonus=0.0, lambda_dynamic=0.5,
-        object_features=1536, extractor_units=512, optimizer="adam",
+        Architecture(
+            style="dreamer_v2", cnn_depth=48, categoricals=32, classes=32, belief=200, hidden=200,
+            mlp_layers=4, mlp_units=400, object_features=1536, extractor_units=512,
+        ),
+        Learning(
+            batch_size=32, slice_len=32, imagination_horizon=15, model_lr=3e-4, actor_lr=8e-5, value_lr=8e-5,
+            entropy_bonus=0.0, lambda_dynamic=0.5, optimizer=Adam(),
+        ),
     ),
     "large": Size(
-        style="dreamer_v3", cnn_depth=64, cnn_mults=(1, 2, 4, 8), categoricals=32, classes=64,
-        belief=2048, hidden=512, gru_blocks=8,
-        mlp_layers=3, mlp_units=512, batch_size=32, slice_len=64, imagination_horizon=15,
-        model_lr=1e-4, actor_lr=4e-5, value_lr=4e-5, warmup=1000,
-        object_features=2048, extractor_units=1024,
+        Architecture(
+            cnn_depth=64, categoricals=32, classes=64, belief=2048, hidden=512,
+            mlp_layers=3, mlp_units=512, object_features=2048, extractor_units=1024,
+        ),
+        Learning(
+            batch_size=32, slice_len=64, imagination_horizon=15, model_lr=1e-4, actor_lr=4e-5, value_lr=4e-5,
+            optimizer=DreamerV3(warmup=1000),
+        ),
     ),
 }
 # fmt: on
@@ -65,15 +86,30 @@ def agent_name(config: AgentConfig) -> str:
     """Name of a row of choices: that of the nearest preset, and in what it differs.
 
     Examples:
-        >>> from dataclasses import replace
-        >>> agent_name(replace(AGENTS["dreamer"], lambda_goal_position=200.0))
-        'dreamer (lambda_goal_position=200.0)'
+        >>> agent_name(AgentConfig(Flat(observed=("proprio", "object_position", "goal_position"), lambda_proprio=2.0)))
+        'dreamer (world_model.lambda_proprio=2.0)'
     """
-    here = asdict(config)
-    differences = {
-        name: {key: value for key, value in here.items() if value != asdict(preset)[key]}
-        for name, preset in AGENTS.items()
-    }
+    here = flat(to_dict(config))
+    differences = {name: _difference(here, flat(to_dict(preset))) for name, preset in AGENTS.items()}
     nearest = min(differences, key=lambda name: len(differences[name]))
     changed = ", ".join(f"{key}={value}" for key, value in differences[nearest].items())
     return f"{nearest} ({changed})" if changed else nearest
+
+
+def flat(values: Mapping[str, Any], at: str = "") -> dict[str, Any]:
+    """A nested mapping with dotted names.
+
+    Examples:
+        >>> flat({"a": {"b": 1, "c": [2]}})
+        {'a.b': 1, 'a.c': [2]}
+    """
+    leaves: dict[str, Any] = {}
+    for name, value in values.items():
+        leaves.update(flat(value, f"{at}{name}.") if isinstance(value, Mapping) else {at + name: value})
+    return leaves
+
+
+def _difference(here: dict[str, Any], there: dict[str, Any]) -> dict[str, Any]:
+    """What is here but not there or otherwise, and as ``None`` what is only there."""
+    names = dict.fromkeys([*here, *there])
+    return {name: here.get(name) for name in names if here.get(name) != there.get(name) or (name in here) != (name in there)}

@@ -1,37 +1,163 @@
-"""One update: world model, actor and critic."""
+"""One update: the world model, and the behaviours that are learnt in its imagination."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torchrl.objectives import DreamerV3ActorLoss, DreamerV3Loss, DreamerV3ModelLoss, DreamerV3ValueLoss
+from torch import nn
+from torchrl.objectives import DreamerV3ActorLoss, DreamerV3ModelLoss, DreamerV3ValueLoss, LossModule
 
 
-class GoalConditionedDreamerLoss(DreamerV3Loss):
-    """TorchRL's :class:`~torchrl.objectives.DreamerV3Loss` with goals in imagination.
+class BehaviourLoss(LossModule):
+    """Actor and critic of one behaviour, trained on one imagined rollout.
 
-    World model, actor and critic in one loss. Imagination starts from every posterior state of the batch, each with a
-    goal of its own, which ``goal_source`` writes. Without a goal source it computes what ``DreamerV3Loss`` computes.
-
-    State, belief and goal travel in one nested entry, ``latent`` (:class:`~torchrl_ocwm.modules.ImaginationEnv`),
-    wherever the world model writes the first two (the keys ``state`` and ``belief``, under ``next``).
-    No gradient of actor or critic reaches the world model, and none of any reaches the goal source.
+    Imagination starts from every posterior state of the batch, each with a goal of its own, which ``goal_source``
+    writes. State, belief and goal travel in one nested entry, ``latent``
+    (:class:`~torchrl_ocwm.modules.ImaginationEnv`). No gradient reaches the frames that imagination starts from, and
+    none the goal source.
 
     Args:
-        model_loss: Loss of the world model, returning its outputs with gradients (``detach_output=False``).
         actor_loss: Imagines and trains the actor; its keys ``state`` and ``belief`` are set to ``"latent"`` here.
         value_loss: Trains the critic on the same imagined trajectories.
-        goal_source: Reads ``latent = {state, belief}`` ``[B * T]``, and what else it names of the records of these
+        goal_source: Reads ``latent = {state, belief}`` ``[B, T]``, and what else it names of the records of these
             states, and writes ``("latent", "goal")``.
+        reward_loss: Trains what the imagined reward is computed with: called with ``records`` ``[B, T]`` and
+            ``imagined`` ``[B * T, H]``, both without gradients, it gives ``loss_*`` entries.
         replay_value_loss_weight: Weight of TorchRL's critic loss on the recorded rewards; these belong to the goals
-            of the records, so that it needs an agent without a goal source.
+            of the records, so that it needs a behaviour without a goal source.
         continuation_horizon: Discount horizon of that term, steps.
         lmbda: λ of that term.
+        prefix: Put before the names of all losses and metrics: ``loss_actor`` becomes ``loss_{prefix}actor``.
 
     Raises:
         ValueError: for a replay value loss together with a goal source.
+
+    Examples:
+        >>> from torchrl_ocwm.agents import build_agent
+        >>> from torchrl_ocwm.testing import random_records, reacher_task
+        >>> agent = build_agent("dreamer_pcp", reacher_task(), size="debug")
+        >>> records = agent.model.records()(random_records(reacher_task(), 2, 5))
+        >>> sorted(key for key in agent.behaviour("reach").loss(records).keys() if key.startswith("loss"))
+        ['loss_actor', 'loss_value']
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys of the frames that imagination starts from.
+
+        Attributes:
+            state (NestedKey): Posterior state under ``next``, ``[B, T, S]``. Defaults to ``"state"``.
+            belief (NestedKey): Belief under ``next``, ``[B, T, H]``. Defaults to ``"belief"``.
+        """
+
+        state: NestedKey = "state"
+        belief: NestedKey = "belief"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_loss: DreamerV3ActorLoss,
+        value_loss: DreamerV3ValueLoss,
+        *,
+        goal_source: TensorDictModuleBase | None = None,
+        reward_loss: LossModule | None = None,
+        replay_value_loss_weight: float = 0.0,
+        continuation_horizon: float = 333.0,
+        lmbda: float = 0.95,
+        prefix: str = "",
+    ) -> None:
+        if goal_source is not None and replay_value_loss_weight:
+            raise ValueError(
+                "replay_value_loss_weight needs recorded rewards for the imagined goals, which do not exist; "
+                "set it to 0 or drop the goal source"
+            )
+        super().__init__()
+        self.actor_loss, self.value_loss, self.reward_loss = actor_loss, value_loss, reward_loss
+        self.goal_source = goal_source
+        self.replay_value_loss_weight, self.prefix = replay_value_loss_weight, prefix
+        self.continuation_horizon, self.lmbda = continuation_horizon, lmbda
+        actor_loss.set_keys(state="latent", belief="latent")
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        pass
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The posterior, and what goal source, reward loss and replay loss read of the records."""
+        after = [self.tensor_keys.state, self.tensor_keys.belief, *self._source_keys()]
+        keys = [unravel_key(("next", key)) for key in after]
+        if self.reward_loss is not None:
+            keys += [key[1:] for key in self.reward_loss.in_keys if isinstance(key, tuple) and key[0] == "records"]
+        if self.replay_value_loss_weight:
+            value = self.value_loss.tensor_keys
+            keys += [unravel_key(("next", key)) for key in (value.reward, value.done, value.terminated)]
+        return list(dict.fromkeys(keys))
+
+    def forward(self, records: TensorDictBase) -> TensorDictBase:
+        """Losses and metrics, scalars, of records ``[B, T]`` with what the world model made of them under ``next``."""
+        actor_losses, imagined = self.actor_loss(self.imagination_start(records.get("next")))
+        losses = actor_losses.update(self.value_loss(imagined.detach())[0])
+        if self.replay_value_loss_weight:
+            losses["loss_replay_value"] = self.replay_value_loss_weight * self._replay_value(records, imagined)
+        if self.reward_loss is not None:
+            seen = TensorDict({"records": records.detach(), "imagined": imagined.detach()})
+            losses.update(self.reward_loss(seen))
+        return TensorDict({self._name(key): value for key, value in losses.items()})
+
+    def imagination_start(self, frames: TensorDictBase) -> TensorDictBase:
+        """Start states ``[B * T]`` with goals, without gradients.
+
+        Args:
+            frames: ``[B, T]`` with posterior states, beliefs and what else the goal source reads.
+        """
+        frames, keys = frames.detach(), self.tensor_keys
+        latent = TensorDict({"state": frames.get(keys.state), "belief": frames.get(keys.belief)}, frames.batch_size)
+        start = TensorDict({"latent": latent}, frames.batch_size)
+        if self.goal_source is None:
+            return start.reshape(-1)
+        with torch.no_grad():
+            goals = self.goal_source(start.copy().update(frames.select(*self._source_keys())))
+        return start.set(("latent", "goal"), goals.get(("latent", "goal"))).reshape(-1)
+
+    def _source_keys(self) -> list[NestedKey]:
+        """What the goal source reads beside state and belief."""
+        source = [] if self.goal_source is None else self.goal_source.in_keys
+        return [key for key in source if key not in (("latent", "state"), ("latent", "belief"))]
+
+    def _name(self, key: str) -> str:
+        return f"loss_{self.prefix}{key[5:]}" if key.startswith("loss_") else self.prefix + key
+
+    def _replay_value(self, records: TensorDictBase, imagined: TensorDictBase) -> torch.Tensor:
+        keys, after = self.value_loss.tensor_keys, records.get("next")
+        latent = {"state": after.get(self.tensor_keys.state), "belief": after.get(self.tensor_keys.belief)}
+        replay = TensorDict({"latent": TensorDict(latent, records.batch_size)}, records.batch_size)
+        replay.set(keys.bootstrap, imagined.get("lambda_target")[..., 0, 0].reshape(records.batch_size))
+        replay.set("next", after.select(keys.reward, keys.done, keys.terminated))
+        losses = self.value_loss.replay_value_loss(replay, horizon=self.continuation_horizon, lmbda=self.lmbda)
+        return losses["loss_replay_value"]
+
+
+class GoalConditionedDreamerLoss(LossModule):
+    """A world model's loss and those of the behaviours that are learnt in its imagination, in one.
+
+    With one behaviour without a goal source it computes what TorchRL's :class:`~torchrl.objectives.DreamerV3Loss`
+    computes. The behaviours start from the same posterior states; no gradient of theirs reaches the world model.
+
+    Args:
+        model_loss: Loss of the world model, returning its outputs with gradients (``detach_output=False``).
+        behaviours: The behaviours by name, or a single one.
+        return_context: Also return the detached latents under ``replay_context``, as TorchRL's stepper wants them.
+
+    Raises:
+        ValueError: when called, if two behaviours give a loss the same name.
 
     Examples:
         >>> from torchrl_ocwm.agents import build_agent
@@ -43,76 +169,68 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
         torch.Size([])
     """
 
+    @dataclass
+    class _AcceptedKeys:
+        """Keys of the records.
+
+        Attributes:
+            state (NestedKey): Where the world model writes its posterior state, under ``next``. Defaults to
+                ``"state"``.
+            belief (NestedKey): Where it writes its belief, under ``next``. Defaults to ``"belief"``.
+            is_init (NestedKey): First records of episodes, ``[B, T, 1]`` bool. Defaults to ``"is_init"``.
+            replay_context (NestedKey): The detached latents, written if asked for. Defaults to ``"replay_context"``.
+        """
+
+        state: NestedKey = "state"
+        belief: NestedKey = "belief"
+        is_init: NestedKey = "is_init"
+        replay_context: NestedKey = "replay_context"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
     def __init__(
         self,
         model_loss: DreamerV3ModelLoss,
-        actor_loss: DreamerV3ActorLoss,
-        value_loss: DreamerV3ValueLoss,
+        behaviours: BehaviourLoss | Mapping[str, BehaviourLoss],
         *,
-        goal_source: TensorDictModuleBase | None = None,
-        replay_value_loss_weight: float = 0.0,
-        continuation_horizon: float = 333.0,
-        lmbda: float = 0.95,
+        return_context: bool = False,
     ) -> None:
-        if goal_source is not None and replay_value_loss_weight:
-            raise ValueError(
-                "replay_value_loss_weight needs recorded rewards for the imagined goals, which do not exist; "
-                "set it to 0 or drop the goal source"
-            )
-        super().__init__(
-            model_loss,
-            actor_loss,
-            value_loss,
-            replay_value_loss_weight=replay_value_loss_weight,
-            continuation_horizon=continuation_horizon,
-            lmbda=lmbda,
-        )
-        actor_loss.set_keys(state="latent", belief="latent")
-        # Not a submodule: the world model's parameters in it are the model loss's.
-        self.__dict__["goal_source"] = goal_source
+        super().__init__()
+        self.model_loss = model_loss
+        single = isinstance(behaviours, BehaviourLoss)
+        self.behaviours = nn.ModuleDict({"behaviour": behaviours} if single else behaviours)
+        self.return_context = return_context
+
+    def set_keys(self, **kwargs: NestedKey) -> None:
+        """Set keys, those of the latents in the behaviours too."""
+        super().set_keys(**kwargs)
+        latents = {name: key for name, key in kwargs.items() if name in ("state", "belief")}
+        if latents:
+            for behaviour in self.behaviours.values():
+                behaviour.set_keys(**latents)
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        pass
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What the world model reads, and the targets of its predictions."""
-        model, done = self.model_loss, unravel_key(("next", self.value_loss.tensor_keys.done))
-        keys = [*model.world_model.in_keys, self.tensor_keys.is_init, *model.targets, done]
+        """What the world model reads, the targets of its predictions, and what behaviours read of the records."""
+        written = set(self.model_loss.world_model.out_keys)
+        behaviours = [key for one in self.behaviours.values() for key in one.in_keys if key not in written]
+        keys = [*self.model_loss.world_model.in_keys, self.tensor_keys.is_init, *self.model_loss.targets, *behaviours]
         return list(dict.fromkeys(keys))
 
     def forward(self, sample: TensorDictBase) -> TensorDictBase:
-        """Losses and metrics of records ``[B, T]``, scalars, and the detached latents under ``replay_context``."""
-        model_losses, records = self.model_loss(sample)
-        after = records.get("next")
-        latent = TensorDict(
-            {"state": after.get(self.tensor_keys.state), "belief": after.get(self.tensor_keys.belief)},
-            sample.batch_size,
-        )
-        actor_losses, imagined = self.actor_loss(self.imagination_start(after))
-        value_losses, _ = self.value_loss(imagined.detach())
-        losses = model_losses.update(actor_losses).update(value_losses)
-        if self.replay_value_loss_weight:
-            losses["loss_replay_value"] = self.replay_value_loss_weight * self._replay_value(sample, latent, imagined)
-        return losses.set(self.tensor_keys.replay_context, latent.detach())
-
-    def imagination_start(self, frames: TensorDictBase) -> TensorDictBase:
-        """Start states ``[B * T]`` with goals, without gradients.
-
-        Args:
-            frames: ``[B, T]`` with posterior states, beliefs and what else the goal source reads.
-        """
-        frames = frames.detach().reshape(-1)
-        keys = self.tensor_keys
-        latent = TensorDict({"state": frames.get(keys.state), "belief": frames.get(keys.belief)}, frames.batch_size)
-        start = TensorDict({"latent": latent}, frames.batch_size)
-        if self.goal_source is None:
-            return start
-        known = [key for key in self.goal_source.in_keys if key not in start.keys(True)]
-        with torch.no_grad():
-            return self.goal_source(start.update(frames.select(*known)))
-
-    def _replay_value(self, sample: TensorDictBase, latent: TensorDictBase, imagined: TensorDictBase):  # type: ignore[no-untyped-def]
-        keys = self.value_loss.tensor_keys
-        replay = TensorDict({"latent": latent}, latent.batch_size)
-        replay.set(keys.bootstrap, imagined.get("lambda_target")[..., 0, 0].reshape(latent.batch_size))
-        replay.set("next", sample.get("next").select(keys.reward, keys.done, keys.terminated))
-        losses = self.value_loss.replay_value_loss(replay, horizon=self.continuation_horizon, lmbda=self.lmbda)
-        return losses["loss_replay_value"]
+        """Losses and metrics of records ``[B, T]``, scalars."""
+        losses, records = self.model_loss(sample)
+        for behaviour in self.behaviours.values():
+            more = behaviour(records)
+            if twice := set(losses.keys()) & set(more.keys()):
+                raise ValueError(f"two losses have the name {sorted(twice)[0]!r}; give the behaviours a prefix each")
+            losses = losses.update(more)
+        if self.return_context:
+            after, keys = records.get("next"), self.tensor_keys
+            latent = {"state": after.get(keys.state), "belief": after.get(keys.belief)}
+            losses.set(keys.replay_context, TensorDict(latent, sample.batch_size).detach())
+        return losses

@@ -90,8 +90,8 @@ def train_offline(
 def _make_sampler(agent: Agent, dataset: EpisodeDataset, training: Training) -> Callable[..., TensorDictBase]:
     replay = make_replay_buffer(
         dataset,
-        batch_size=agent.size.batch_size,
-        slice_len=agent.size.slice_len,
+        batch_size=agent.size.learning.batch_size,
+        slice_len=agent.size.learning.slice_len,
         transform=RelabelGoals(agent.task.workspace, goals=training.goals),
     )
 

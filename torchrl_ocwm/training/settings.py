@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
-from torchrl_ocwm.agents.config import check_choices
+from torchrl_ocwm.settings import Settings, SettingsError, setting
 
 
 @dataclass(frozen=True)
-class Training:
+class Training(Settings):
     """Settings of a training run.
 
     Args:
@@ -36,28 +36,27 @@ class Training:
         loggers: Where to log beside the CSV files.
     """
 
-    updates: int = 10_000
-    seed: int = 0
+    updates: int = setting(10_000, at_least=1, at_most=10**9)
+    seed: int = setting(0, at_least=0, at_most=2**32 - 1)
     device: str = "cpu"
-    threads: int = 0
-    log_interval: int = 50
-    checkpoint_interval: int = 500
-    eval_interval: int = 500
-    eval_episodes: int = 10
-    eval_steps: int = 100
-    video_interval: int = 2000
+    threads: int = setting(0, at_least=0, at_most=1024)
+    log_interval: int = setting(50, at_least=1)
+    checkpoint_interval: int = setting(500, at_least=1)
+    eval_interval: int = setting(500, at_least=0)
+    eval_episodes: int = setting(10, at_least=1)
+    eval_steps: int = setting(100, at_least=1)
+    video_interval: int = setting(2000, at_least=0)
     goals: Literal["uniform", "stored"] = "uniform"
     compile: bool | None = None
     cudagraph: bool | None = None
     mixed_precision: bool = False
-    final_lr: float = 0.1
-    target_rate: float = 0.02
-    loggers: tuple[Literal["tensorboard", "wandb"], ...] = field(default=())
+    final_lr: float = setting(0.1, at_least=0, at_most=1)
+    target_rate: float = setting(0.02, above=0, at_most=1)
+    loggers: tuple[Literal["tensorboard", "wandb"], ...] = ()
 
-    def __post_init__(self) -> None:
-        for name in ("updates", "log_interval", "checkpoint_interval", "eval_episodes", "eval_steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+    def check(self) -> None:
+        """Whole ticks of the log."""
         if self.updates % self.log_interval:
-            raise ValueError(f"updates must be a multiple of log_interval, got {self.updates} and {self.log_interval}")
-        check_choices(self)
+            raise SettingsError(
+                f"updates must be a multiple of log_interval, got {self.updates} and {self.log_interval}"
+            )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -13,7 +14,7 @@ from torchrl.trainers import Trainer
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 
 from torchrl_ocwm.agents.agent import Agent
-from torchrl_ocwm.training.optimizer import make_optimizer
+from torchrl_ocwm.objectives import GoalConditionedDreamerLoss
 from torchrl_ocwm.training.settings import Training
 
 
@@ -32,6 +33,9 @@ def one_graph() -> AbstractContextManager[None]:
 
 class Stepper(DreamerV3OptimizationStepper):
     """TorchRL's DreamerV3 stepper with mixed precision on CPUs too, and nothing in the step that breaks its graph."""
+
+    def _prepare_sample(self, sample: TensorDictBase) -> TensorDictBase:
+        return sample.select(*self.loss_module.in_keys, strict=False)
 
     def _forward_backward(self, sample: TensorDictBase) -> TensorDictBase:
         device = sample.get(self.loss_module.tensor_keys.is_init).device.type
@@ -54,12 +58,38 @@ class Stepper(DreamerV3OptimizationStepper):
         return super().step(trainer, sub_batch)
 
 
+class SlowCritics:
+    """The slow critics of all behaviours move together.
+
+    Args:
+        loss: The loss whose behaviours have them.
+        tau: Share of the critic that moves into its slow critic at each step.
+    """
+
+    def __init__(self, loss: GoalConditionedDreamerLoss, *, tau: float) -> None:
+        self.updaters = {name: SoftUpdate(one.value_loss, tau=tau) for name, one in loss.behaviours.items()}
+
+    def step(self) -> None:
+        """Move them."""
+        for updater in self.updaters.values():
+            updater.step()
+
+    def state_dict(self) -> dict[str, Any]:
+        """State of each."""
+        return {name: updater.state_dict() for name, updater in self.updaters.items()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore each."""
+        for name, updater in self.updaters.items():
+            updater.load_state_dict(state_dict[name])
+
+
 def make_stepper(agent: Agent, training: Training) -> DreamerV3OptimizationStepper:
     """A stepper: forward, backward, optimiser and slow critic."""
     return Stepper(
         agent.loss,
-        make_optimizer(agent),
-        SoftUpdate(agent.loss.value_loss, tau=training.target_rate),
+        agent.size.learning.optimizer.build(agent.parameter_groups()),
+        SlowCritics(agent.loss, tau=training.target_rate),
         compile_train_step=training.compile,
         cudagraph=training.cudagraph,
         mixed_precision=training.mixed_precision,

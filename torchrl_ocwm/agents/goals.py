@@ -1,0 +1,139 @@
+"""Goals: what policy and critic see of them, beside the latent state."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+
+from torchrl_ocwm.agents.scene import Scene
+from torchrl_ocwm.modules import LatentPositionalEncoder, ObjectWorldModel
+from torchrl_ocwm.modules.goals import GOAL
+from torchrl_ocwm.parts import Part, register
+from torchrl_ocwm.settings import SettingsError, setting
+
+
+class GoalEncoding(NamedTuple):
+    """What a goal is for policy and critic, and how it is made of what there is.
+
+    Args:
+        features: How many numbers it is.
+        position: Encodes positions ``[..., D]`` in workspace units, if it can be done.
+        image: Encodes images ``[..., F, 3, H, W]`` uint8, if it can be done.
+        frame: Writes ``("latent", "goal")``, the goal that a frame of the records is.
+    """
+
+    features: int
+    position: nn.Module | None
+    image: nn.Module | None
+    frame: TensorDictModuleBase
+
+
+class Goal(Part, kind="goal"):
+    """How a goal becomes what policy and critic see."""
+
+    @property
+    def needs(self) -> Mapping[str, Any]:
+        """What it asks of the world model."""
+        return {}
+
+    @abstractmethod
+    def build(self, scene: Scene) -> GoalEncoding | None:
+        """The encoding, or nothing if policy and critic see no goal."""
+
+
+@register("none")
+@dataclass(frozen=True)
+class NoGoal(Goal):
+    """Actor and critic see the latent state only; the world model has to remember the goal that it observed."""
+
+    def build(self, scene: Scene) -> None:
+        """Nothing."""
+
+
+@register("position")
+@dataclass(frozen=True)
+class Position(Goal):
+    """They also see the goal position, in workspace units (paper, section PCP)."""
+
+    def build(self, scene: Scene) -> GoalEncoding:
+        """The position as it is."""
+        dim = scene.model.units.dim
+        select = nn.Sequential(nn.Unflatten(-1, (-1, dim)), SelectObject(scene.object_index))
+        return GoalEncoding(dim, nn.Identity(), None, TensorDictModule(select, ["object_units"], [GOAL]))
+
+
+@register("object_latent")
+@dataclass(frozen=True)
+class ObjectLatent(Goal):
+    """They also see the latent that the object would have at the goal (paper, section LCP).
+
+    Args:
+        weight: Weight of the loss of the latent positional encoder, which learns that latent.
+        distance: How far apart two latents are in that loss: minus the cosine similarity, or the mean squared error.
+        gradient: What that loss trains: the encoder, the object latents that it aims at, or both.
+    """
+
+    weight: float = setting(1.0, at_least=0)
+    distance: Literal["cosine", "mse"] = "cosine"
+    gradient: Literal["encoder", "latent", "both"] = "both"
+
+    @property
+    def needs(self) -> Mapping[str, Any]:
+        """A positional encoder, and how it is trained."""
+        loss = {
+            "lambda_positional": self.weight,
+            "positional_distance": self.distance,
+            "positional_gradient": self.gradient,
+        }
+        return {"positional_encoder": loss}
+
+    def build(self, scene: Scene) -> GoalEncoding:
+        """The latent at a position, in images or in a frame."""
+        model, index = object_centric(scene.model), scene.object_index
+        encoder = model.positional_encoder
+        assert encoder is not None
+        frame = TensorDictModule(SelectObject(index), ["image_latent"], [GOAL])
+        image = nn.Sequential(model.latents_in_images(), SelectObject(index))
+        return GoalEncoding(encoder.features, _LatentAtGoal(encoder, index), image, frame)
+
+
+def object_centric(model: nn.Module) -> ObjectWorldModel:
+    """The model, if it has object latents.
+
+    Raises:
+        SettingsError: if it has none.
+    """
+    if not isinstance(model, ObjectWorldModel):
+        raise SettingsError("goals and rewards on object latents need world_model='object'")
+    return model
+
+
+class SelectObject(nn.Module):
+    """What belongs to one object, ``[..., O, any]`` to ``[..., any]``.
+
+    Args:
+        index: Which object.
+    """
+
+    def __init__(self, index: int) -> None:
+        super().__init__()
+        self.index = index
+
+    def forward(self, objects: Tensor) -> Tensor:
+        return objects[..., self.index, :]
+
+
+class _LatentAtGoal(nn.Module):
+    """Goal positions ``[..., D]`` to the latent ``[..., L]`` of an object there."""
+
+    def __init__(self, encoder: LatentPositionalEncoder, index: int) -> None:
+        super().__init__()
+        self.encoder, self.index = encoder, index
+
+    def forward(self, goal_units: Tensor) -> Tensor:
+        return self.encoder(goal_units.unsqueeze(-2), object_index=self.index).squeeze(-2)

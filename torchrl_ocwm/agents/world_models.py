@@ -1,0 +1,118 @@
+"""World models: the parts that observe, remember and predict."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.modules import FlatWorldModel, ObjectWorldModel, WorkspaceUnits, WorldModel
+from torchrl_ocwm.modules.architecture import Architecture
+from torchrl_ocwm.modules.world_model import VectorName
+from torchrl_ocwm.objectives import FOCUSModelLoss, WorldModelLoss
+from torchrl_ocwm.parts import Part, register
+from torchrl_ocwm.settings import SettingsError, setting
+
+
+class WorldModelPart(Part, kind="world_model"):
+    """How a world model is built, and what trains it."""
+
+    @abstractmethod
+    def build(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> WorldModel:
+        """The world model.
+
+        Args:
+            task: Shapes and workspace.
+            architecture: How large its networks are.
+            needs: What goals and rewards ask of it (:attr:`~torchrl_ocwm.agents.goals.Goal.needs`).
+
+        Raises:
+            SettingsError: if it cannot give what is needed.
+        """
+
+    @abstractmethod
+    def loss(self, model: WorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> WorldModelLoss:
+        """What trains it; ``lambda_dynamic`` is the weight of the KL that trains the prior."""
+
+
+@dataclass(frozen=True)
+class _Observing(WorldModelPart):
+    observed: tuple[VectorName, ...] = ("proprio", "object_position")
+    lambda_proprio: float = setting(1.0, at_least=0)
+    lambda_object_position: float = setting(200.0, at_least=0)
+    lambda_goal_position: float = setting(1.0, at_least=0)
+
+    def check(self) -> None:
+        """A weight of what is not observed does nothing."""
+        for one in fields(self):
+            name = one.name.removeprefix("lambda_")
+            if name != one.name and name not in self.observed and getattr(self, one.name) != one.default:
+                raise SettingsError(f"{one.name} does nothing: {name!r} is not in observed={self.observed}")
+
+    def _arguments(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> dict[str, Any]:
+        known = {"reward_head"} | ({"positional_encoder"} if isinstance(self, ObjectCentric) else set())
+        if odd := sorted(set(needs) - known):
+            raise SettingsError(f"world_model={self._name!r} has no {odd[0]}, which a goal or a reward needs")
+        return {
+            "image_size": task.image_size,
+            "proprio": task.proprio,
+            "objects": len(task.objects),
+            "action": task.action,
+            "units": WorkspaceUnits(task.workspace.low, task.workspace.high),
+            "observed": self.observed,
+            "reward_head": "reward_head" in needs,
+            **asdict(architecture),
+        }
+
+    def _weights(self, lambda_dynamic: float) -> dict[str, float]:
+        names = ("lambda_proprio", "lambda_object_position", "lambda_goal_position")
+        return {"lambda_dynamic": lambda_dynamic, **{name: getattr(self, name) for name in names}}
+
+
+@register("flat")
+@dataclass(frozen=True)
+class Flat(_Observing):
+    """One latent state for the whole scene (Dreamer).
+
+    Args:
+        observed: Vectors that the world model sees and reconstructs, beside the image.
+        lambda_proprio: Weight of the reconstruction of proprioception.
+        lambda_object_position: Weight of the reconstruction of the object positions.
+        lambda_goal_position: Weight of the reconstruction of the goal position.
+    """
+
+    def build(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> FlatWorldModel:
+        """A world model with one latent."""
+        arguments = self._arguments(task, architecture, needs)
+        del arguments["object_features"], arguments["extractor_units"]
+        return FlatWorldModel(**arguments)
+
+    def loss(self, model: WorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> WorldModelLoss:
+        """What trains it."""
+        del needs
+        return WorldModelLoss(model.records(), **self._weights(lambda_dynamic))
+
+
+@register("object")
+@dataclass(frozen=True)
+class ObjectCentric(_Observing):
+    """A latent for each object and the background too, from which masks, colours and positions are decoded (FOCUS).
+
+    Args:
+        observed: Vectors that the world model sees and reconstructs, beside the image.
+        lambda_proprio: Weight of the reconstruction of proprioception.
+        lambda_object_position: Weight of the reconstruction of the object positions.
+        lambda_goal_position: Weight of the reconstruction of the goal position.
+    """
+
+    def build(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> ObjectWorldModel:
+        """A world model with object latents, and a positional encoder if a goal needs one."""
+        arguments = self._arguments(task, architecture, needs)
+        return ObjectWorldModel(**arguments, positional_encoder="positional_encoder" in needs)
+
+    def loss(self, model: WorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> FOCUSModelLoss:
+        """What trains it."""
+        positional = needs.get("positional_encoder", {})
+        return FOCUSModelLoss(model.records(), **positional, **self._weights(lambda_dynamic))
