@@ -33,6 +33,7 @@ from torchrl_ocwm.modules import (
     ObjectWorldModel,
     PositionDistanceReward,
     UniformGoals,
+    UnitRMS,
     WorkspaceUnits,
     WorldModel,
 )
@@ -116,23 +117,31 @@ class Goal(NamedTuple):
     frame: TensorDictModuleBase
 
 
-def position_goal(model: WorldModel) -> Goal:
+def position_goal(model: WorldModel, _: AgentConfig) -> Goal:
     """The goal position itself (paper, section PCP)."""
     objects = nn.Unflatten(-1, (-1, model.units.dim))
     frame = TensorDictModule(nn.Sequential(objects, _First()), ["object_units"], [GOAL])
     return Goal(model.units.dim, nn.Identity(), None, frame)
 
 
-def object_latent_goal(model: WorldModel) -> Goal:
-    """The latent that the object to be positioned would have at the goal (paper, section LCP)."""
+def object_latent_goal(model: WorldModel, config: AgentConfig) -> Goal:
+    """The latent that the object to be positioned would have at the goal (paper, section LCP).
+
+    Positions and images are encoded by different networks, which are trained to agree in direction only. All goals are
+    brought to one length here, so that an actor trained on the one kind knows the other. With
+    ``latent_distance="mse"`` training and reward compare lengths too, so that they stay as they are.
+    """
     model = _object_centric(model)
     assert model.positional_encoder is not None
-    image = nn.Sequential(model.latents_in_images(), _First())
-    frame = TensorDictModule(_First(), ["image_latent"], [GOAL])
-    return Goal(model.positional_encoder.features, _LatentAtGoal(model.positional_encoder), image, frame)
+    features = model.positional_encoder.features
+    length = UnitRMS() if config.latent_distance == "cosine" else nn.Identity()
+    position = nn.Sequential(_LatentAtGoal(model.positional_encoder), length)
+    image = nn.Sequential(model.latents_in_images(), _First(), length)
+    frame = TensorDictModule(nn.Sequential(_First(), length), ["image_latent"], [GOAL])
+    return Goal(features, position, image, frame)
 
 
-def no_goal(model: WorldModel) -> None:
+def no_goal(model: WorldModel, _: AgentConfig) -> None:
     """Nothing: the world model has to remember the goal that it observed."""
 
 
@@ -187,7 +196,7 @@ WORLD_MODELS = {
     "flat": WorldModelChoice(flat_world_model, flat_loss),
     "object": WorldModelChoice(object_world_model, object_loss),
 }
-GOALS: dict[str, Callable[[WorldModel], Goal | None]] = {
+GOALS: dict[str, Callable[[WorldModel, AgentConfig], Goal | None]] = {
     "none": no_goal,
     "position": position_goal,
     "object_latent": object_latent_goal,
@@ -250,7 +259,7 @@ class Agent(nn.Module):
         super().__init__()
         self.task, self.config, self.size = task, config, size
         self.model = WORLD_MODELS[config.world_model].build(task, config, size)
-        goal = self.goal = GOALS[config.goal](self.model)
+        goal = self.goal = GOALS[config.goal](self.model, config)
         features = 0 if goal is None else goal.features
         if (config.goal_source == "environment") != (goal is None):
             raise ValueError(
