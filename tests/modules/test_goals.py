@@ -8,7 +8,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from torchrl_ocwm.modules import FrameGoals, GivenGoals, MixedGoals, WorkspaceUnits
+from torchrl_ocwm.agents import Agent
+from torchrl_ocwm.modules import FrameGoals, GivenGoals, MixedGoals, UnitRMS, WorkspaceUnits
+from torchrl_ocwm.modules.rewards import LatentSimilarity
 from torchrl_ocwm.testing import random_records, reacher_task
 
 UNITS = WorkspaceUnits((-0.2, -0.2), (0.2, 0.2))
@@ -44,7 +46,7 @@ def test_where_goals_come_from(make_agent: Any, records: TensorDict, name: str, 
     goals = agent.loss.imagination_start(after["next"])["latent", "goal"]
     key = "image_latent" if name == "focus_lcp" else "object_units"
     known = after["next", key].flatten(0, 1)
-    known = known[:, 0] if name == "focus_lcp" else known
+    known = UnitRMS()(known[:, 0]) if name == "focus_lcp" else known
     among = (goals.unsqueeze(1) == known).all(-1).any(1)
     assert not goals.requires_grad
     assert among.all() if source == "frames" else not among.any() if source == "uniform" else among.any()
@@ -97,7 +99,49 @@ def test_an_image_is_encoded_as_in_training(make_agent: Any, records: TensorDict
     trained = agent.loss.model_loss(records)[1]["next", "image_latent"][:, :4].flatten(0, 1)[:, 0]
     images = records["next", "pixels"][:, :4].flatten(0, 1)
     acting = agent.policy()(observation(8).set("goal", TensorDict({"pixels": images}, [8])))["latent", "goal"]
-    torch.testing.assert_close(acting, trained)
+    torch.testing.assert_close(acting, UnitRMS()(trained))
+
+
+def goals_of_every_kind(agent: Agent, records: TensorDict) -> dict[str, torch.Tensor]:
+    """The goal latents that reach the actor: of a policy's positions and images, and in imagination."""
+    images = records["next", "pixels"].flatten(0, 1)
+    number, seen = len(images), []
+    hook = agent.actor[0].module.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[2]))
+    policy = agent.policy()
+    policy(observation(number))
+    policy(observation(number).set("goal", TensorDict({"pixels": images}, [number])))
+    agent.actor(agent.loss.imagination_start(agent.loss.model_loss(records)[1]["next"]))
+    hook.remove()
+    return dict(zip(("position", "image", "imagination"), seen, strict=True))
+
+
+@pytest.mark.parametrize("source", ["uniform", "frames", "mixed"])
+def test_goal_latents_of_every_kind_have_one_length(make_agent: Any, records: TensorDict, source: str) -> None:
+    agent = make_agent("focus_lcp", goal_source=source)
+    with torch.no_grad():  # the two encoders need not agree
+        agent.model.positional_encoder.mlp.model[-1].weight.mul_(5)
+    goals = goals_of_every_kind(agent, records)
+    for kind, goal in goals.items():
+        length = torch.full(goal.shape[:-1], goal.shape[-1] ** 0.5)
+        torch.testing.assert_close(goal.norm(dim=-1), length, msg=kind)
+        assert goal.std(0).max() > 0.01  # directions are kept
+
+
+@pytest.mark.parametrize("distance", ["cosine", "chord"])
+def test_rewards_do_not_see_the_length_of_a_goal(distance: Any) -> None:
+    latents, goal = torch.randn(5, 2, 4), torch.randn(5, 4)
+    reward = LatentSimilarity(distance=distance)
+    torch.testing.assert_close(reward(latents, goal), reward(latents, UnitRMS()(goal)))
+
+
+def test_lengths_stay_where_training_and_reward_compare_them(make_agent: Any, records: TensorDict) -> None:
+    agent = make_agent("focus_lcp", latent_distance="mse", reward="latent_similarity")
+    goals = goals_of_every_kind(agent, records)
+    metres = observation(len(goals["position"]))["goal_position"]
+    encoded = agent.model.positional_encoder(agent.model.units(metres).unsqueeze(-2))[:, 0]
+    torch.testing.assert_close(goals["position"], encoded)
+    for kind, goal in goals.items():
+        assert goal.norm(dim=-1).std() > 0.01, kind
 
 
 @pytest.mark.usefixtures("no_noise")

@@ -53,7 +53,7 @@ class LearntBehaviour(nn.Module):
         self.goal = config.goal.build(scene)
         features = 0 if self.goal is None else self.goal.features
         _check_goals(config, self.goal)
-        reward = config.reward.build(scene)
+        reward = config.reward.build(scene, self.goal)
         _check_reward(config, reward, features)
         self.actor = make_actor(scene, features)
         self.imagination = ImaginationEnv(

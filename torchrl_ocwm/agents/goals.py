@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_ocwm.agents.scene import Scene
-from torchrl_ocwm.modules import LatentPositionalEncoder, ObjectWorldModel
+from torchrl_ocwm.modules import LatentPositionalEncoder, ObjectWorldModel, UnitRMS
 from torchrl_ocwm.modules.goals import GOAL
 from torchrl_ocwm.parts import Part, register
 from torchrl_ocwm.settings import SettingsError, setting
@@ -25,12 +25,14 @@ class GoalEncoding(NamedTuple):
         position: Encodes positions ``[..., D]`` in workspace units, if it can be done.
         image: Encodes images ``[..., F, 3, H, W]`` uint8, if it can be done.
         frame: Writes ``("latent", "goal")``, the goal that a frame of the records is.
+        directions: Whether only its direction means something; its length is then the same for all goals.
     """
 
     features: int
     position: nn.Module | None
     image: nn.Module | None
     frame: TensorDictModuleBase
+    directions: bool = False
 
 
 class Goal(Part, kind="goal"):
@@ -72,6 +74,10 @@ class Position(Goal):
 class ObjectLatent(Goal):
     """They also see the latent that the object would have at the goal (paper, section LCP).
 
+    Positions and images are encoded by different networks, which are trained to agree in direction only. All goals are
+    brought to one length here, so that an actor trained on the one kind knows the other. With ``distance="mse"``
+    training compares lengths too, so that they stay as they are.
+
     Args:
         weight: Weight of the loss of the latent positional encoder, which learns that latent.
         distance: How far apart two latents are in that loss: minus the cosine similarity, or the mean squared error.
@@ -94,12 +100,13 @@ class ObjectLatent(Goal):
 
     def build(self, scene: Scene) -> GoalEncoding:
         """The latent at a position, in images or in a frame."""
-        model, index = object_centric(scene.model), scene.object_index
-        encoder = model.positional_encoder
-        assert encoder is not None
-        frame = TensorDictModule(SelectObject(index), ["image_latent"], [GOAL])
-        image = nn.Sequential(model.latents_in_images(), SelectObject(index))
-        return GoalEncoding(encoder.features, _LatentAtGoal(encoder, index), image, frame)
+        model, index, directions = object_centric(scene.model), scene.object_index, self.distance == "cosine"
+        assert model.positional_encoder is not None
+        length = UnitRMS() if directions else nn.Identity()
+        position = nn.Sequential(_LatentAtGoal(model.positional_encoder, index), length)
+        image = nn.Sequential(model.latents_in_images(), SelectObject(index), length)
+        frame = TensorDictModule(nn.Sequential(SelectObject(index), length), ["image_latent"], [GOAL])
+        return GoalEncoding(model.positional_encoder.features, position, image, frame, directions)
 
 
 def object_centric(model: nn.Module) -> ObjectWorldModel:

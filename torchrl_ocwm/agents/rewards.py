@@ -10,10 +10,11 @@ from typing import Any, Literal, NamedTuple
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.objectives import LossModule
 
-from torchrl_ocwm.agents.goals import object_centric
+from torchrl_ocwm.agents.goals import GoalEncoding, object_centric
 from torchrl_ocwm.agents.scene import Scene
 from torchrl_ocwm.modules import LatentSimilarityReward, PositionDistanceReward
 from torchrl_ocwm.parts import Part, register
+from torchrl_ocwm.settings import SettingsError
 
 
 class ImaginedReward(NamedTuple):
@@ -40,8 +41,13 @@ class Reward(Part, kind="reward"):
         return {}
 
     @abstractmethod
-    def build(self, scene: Scene) -> ImaginedReward:
-        """The reward for one object of a scene."""
+    def build(self, scene: Scene, goal: GoalEncoding | None) -> ImaginedReward:
+        """The reward for one object of a scene.
+
+        Args:
+            scene: World model and object.
+            goal: How goals are encoded, ``None`` for a behaviour that sees none.
+        """
 
 
 @register("head")
@@ -54,7 +60,7 @@ class LearnedReward(Reward):
         """The head."""
         return {"reward_head": True}
 
-    def build(self, scene: Scene) -> ImaginedReward:
+    def build(self, scene: Scene, goal: GoalEncoding | None) -> ImaginedReward:
         """The head's prediction."""
         return ImaginedReward(scene.model.reward())
 
@@ -64,7 +70,7 @@ class LearnedReward(Reward):
 class PositionDistance(Reward):
     """Minus the distance in metres between the decoded position of the object and the goal (paper, equation 3)."""
 
-    def build(self, scene: Scene) -> ImaginedReward:
+    def build(self, scene: Scene, goal: GoalEncoding | None) -> ImaginedReward:
         """The distance, from the decoded positions."""
         distance = PositionDistanceReward(scene.model.units, object_index=scene.object_index)
         return ImaginedReward(TensorDictSequential(scene.model.object_position(), distance))
@@ -81,8 +87,10 @@ class LatentSimilarity(Reward):
 
     distance: Literal["cosine", "mse"] = "cosine"
 
-    def build(self, scene: Scene) -> ImaginedReward:
+    def build(self, scene: Scene, goal: GoalEncoding | None) -> ImaginedReward:
         """The similarity, from the extracted latents."""
+        if self.distance == "mse" and goal is not None and goal.directions:
+            raise SettingsError("distance='mse' compares lengths, which these goals do not have: give them it too")
         return _on_object_latent(scene, self.distance)
 
 
@@ -91,7 +99,7 @@ class LatentSimilarity(Reward):
 class LatentChord(Reward):
     """Minus the distance between the directions of the two latents, which keeps its slope up to the goal."""
 
-    def build(self, scene: Scene) -> ImaginedReward:
+    def build(self, scene: Scene, goal: GoalEncoding | None) -> ImaginedReward:
         """The chord, from the extracted latents."""
         return _on_object_latent(scene, "chord")
 

@@ -2,7 +2,7 @@
 
 from torchrl_ocwm.modules.acting import ActingLatent
 from torchrl_ocwm.modules.actor import Actor
-from torchrl_ocwm.modules.goals import FrameGoals, GivenGoals, MixedGoals, UniformGoals
+from torchrl_ocwm.modules.goals import FrameGoals, GivenGoals, MixedGoals, UniformGoals, UnitRMS
 from torchrl_ocwm.modules.imagination import ImaginationEnv
 from torchrl_ocwm.modules.latent import InitialLatent, LatentOfImages
 from torchrl_ocwm.modules.object_world_model import LatentsInImages, ObjectWorldModel
@@ -37,6 +37,7 @@ __all__ = [
     "PositionDistance",
     "PositionDistanceReward",
     "UniformGoals",
+    "UnitRMS",
     "WorkspaceUnits",
     "WorldModel",
     "position_distance",

@@ -7,10 +7,29 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from torchrl_ocwm.modules.units import WorkspaceUnits
 
 GOAL: NestedKey = ("latent", "goal")
+
+
+class UnitRMS(nn.Module):
+    """Bring latents to one length and keep their direction.
+
+    The length is √L, so that a feature is of size one as the other inputs of actor and critic are. Of a unit vector of
+    hundreds of features each would be too small for a network to see.
+
+    Called with ``[..., L]``; returns ``[..., L]``.
+
+    Examples:
+        >>> UnitRMS()(torch.tensor([[0.03, 0.04], [3.0, 4.0]]))
+        tensor([[0.8485, 1.1314],
+                [0.8485, 1.1314]])
+    """
+
+    def forward(self, latent: Tensor) -> Tensor:
+        return normalize(latent, dim=-1) * latent.shape[-1] ** 0.5
 
 
 class UniformGoals(TensorDictModuleBase):
