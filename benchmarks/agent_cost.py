@@ -43,7 +43,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
@@ -56,6 +55,7 @@ from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.envs.workspace import Workspace
+from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_stepper
@@ -63,8 +63,15 @@ from torchrl_ocwm.training.stepper import make_stepper
 T = TypeVar("T")
 
 TASK = Task("benchmark", 64, ("object",), 50, 4, Workspace(low=(-0.3, -0.3, 0.0), high=(0.3, 0.3, 0.3)))
-PEER_SIZE = replace(
-    SIZES["paper"], cnn_depth=16, batch_size=8, slice_len=16, imagination_horizon=15, object_features=32 * 16
+PEER_SIZE = change(
+    SIZES["paper"],
+    {
+        "architecture.cnn_depth": 16,
+        "architecture.object_features": 32 * 16,
+        "learning.batch_size": 8,
+        "learning.slice_len": 16,
+        "learning.imagination_horizon": 15,
+    },
 )
 ALL_SIZES = {**SIZES, "peer": PEER_SIZE}
 PARTS = ("encoder", "RSSM", "decoders", "imagination", "optimiser", "other")
@@ -214,9 +221,8 @@ class CutUpdate:
 
     def _imagine(self, records: TensorDictBase) -> None:
         with self._precision():
-            actor_losses, imagined = self.loss.actor_loss(self.loss.imagination_start(records.get("next")))
-            value_losses, _ = self.loss.value_loss(imagined.detach())
-        (_total(actor_losses) + _total(value_losses)).backward()
+            losses = [behaviour(records) for behaviour in self.loss.behaviours.values()]
+        sum(map(_total, losses), torch.zeros(())).backward()
 
     def _precision(self) -> torch.autocast:
         return torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=self.stepper.mixed_precision)
@@ -261,7 +267,7 @@ def measure_whole(batch: TensorDictBase, arguments: argparse.Namespace) -> dict[
         stepper.warmup(batch)
 
     def step() -> None:
-        stepper.step(None, batch.copy())  # it adds a key, and an update is compiled anew for that
+        stepper.step(None, batch.copy())
 
     step()
 
@@ -288,7 +294,7 @@ def child(arguments: argparse.Namespace) -> None:
     """Measure one agent at one size, and print it as JSON."""
     torch.set_num_threads(arguments.threads)
     torch.manual_seed(0)
-    size = ALL_SIZES[arguments.child[1]]
+    size = ALL_SIZES[arguments.child[1]].learning
     batch = random_records(TASK, size.batch_size, size.slice_len).to(arguments.device)
     result = measure_whole(batch, arguments)  # first, so that the peak is its own
     print(json.dumps({**result, "parts": measure_parts(batch, arguments)}))
@@ -329,7 +335,8 @@ def spread(values: Sequence[float], form: str) -> str:
 def print_table(size: str, agents: Sequence[str], updates: int) -> None:
     """Measure the agents at a size, with a row as soon as there is one."""
     sizes, results = ALL_SIZES[size], []
-    print(f"\nSize {size}: {sizes.batch_size} sequences of {sizes.slice_len} frames, CNN depth {sizes.cnn_depth}\n")
+    batch, depth = (sizes.learning.batch_size, sizes.learning.slice_len), sizes.architecture.cnn_depth
+    print(f"\nSize {size}: {batch[0]} sequences of {batch[1]} frames, CNN depth {depth}\n")
     peer = ["peer s", "peer s / ours", "peer MiB", "peer MiB / ours"]
     head = ["agent", "s/update", "x reference", "peak MiB", *peer, *PARTS]
     print(line(head), line(["---", *["---:"] * (len(head) - 1)]), sep="\n", flush=True)

@@ -33,8 +33,8 @@ def make_sampler(agent: Agent, dataset: EpisodeDataset, device: str) -> Callable
     """Batches as in training."""
     replay = make_replay_buffer(
         dataset,
-        batch_size=agent.size.batch_size,
-        slice_len=agent.size.slice_len,
+        batch_size=agent.size.learning.batch_size,
+        slice_len=agent.size.learning.slice_len,
         transform=RelabelGoals(agent.task.workspace),
     )
     return lambda: replay.sample().to(device)
@@ -107,7 +107,7 @@ def main() -> None:
 
     whole = [sum(parts) for parts in zip(sampling, stepping, strict=True)]
     share = statistics.median(part / update for part, update in zip(sampling, whole, strict=True))
-    size = SIZES[arguments.size]
+    size = SIZES[arguments.size].learning
     print(f"{arguments.agent}, size {arguments.size}, {size.batch_size} sequences of {size.slice_len} frames", end="")
     print(f", {dataset.num_steps} steps; {arguments.device}, {arguments.threads} threads", end="")
     print(f", median of {arguments.rounds} rounds of {arguments.updates} updates")

@@ -5,35 +5,54 @@ Can be stopped (Ctrl-C, SIGTERM) and run again: it goes on where it was, to the 
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from omegaconf import DictConfig
 
 from torchrl_ocwm.agents import AgentConfig, Size, build_agent
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.envs import Task
+from torchrl_ocwm.envs.registry import EnvChoice
 from torchrl_ocwm.evaluation import LandmarkEvaluation
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm
-from torchrl_ocwm.training.config import keep_config, recipe, to_dataclass
+from torchrl_ocwm.recipes import recipe
+from torchrl_ocwm.settings import Settings
 from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.settings import Training
 
 
-@recipe(Path(__file__).parent / "config", "train_offline")
-def main(config: DictConfig) -> None:
-    training = to_dataclass(Training, config.training)
+@dataclass(frozen=True)
+class TrainOffline(Settings):
+    """Settings of offline training.
+
+    Args:
+        agent: World model and behaviours.
+        env: The environment of the dataset.
+        size: How large the agent is, and how it learns.
+        training: How the run goes.
+        dataset: Folder of the dataset to train on (collect).
+        output: Folder for checkpoint, log, videos and configuration. A checkpoint that is there already is continued.
+    """
+
+    agent: AgentConfig
+    env: EnvChoice
+    size: Size
+    training: Training = field(default_factory=Training)
+    dataset: str = "data/${env.name}"
+    output: str = (
+        "outputs/${env.name}/${hydra:runtime.choices.agent}/${hydra:runtime.choices.size}/seed_${training.seed}"
+    )
+
+
+@recipe("train_offline", {"agent": "dreamer_pcp", "env": "reacher", "size": "cpu"})
+def main(config: TrainOffline) -> None:
+    training = config.training
     dataset = EpisodeDataset.open(config.dataset)
     if dataset.metadata.get("environment") != config.env.name:
         raise DatasetError(f"{dataset.path}: holds {dataset.metadata.get('environment')}, not env={config.env.name}")
-    config.env.options = dataset.metadata["options"]  # whatever the command line says: these are what is trained on
-    keep_config(config)
     torch.manual_seed(training.seed)
-    agent = build_agent(
-        to_dataclass(AgentConfig, config.agent),
-        Task.from_dict(dataset.metadata["task"]),
-        to_dataclass(Size, config.size),
-    )
+    agent = build_agent(config.agent, Task.from_dict(dataset.metadata["task"]), config.size)
     evaluation = LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps)
     checkpoint = train_offline(
         agent,

@@ -1,8 +1,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -12,6 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_ocwm.agents import AGENTS, Agent, build_agent
+from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records, reacher_task
 
 
@@ -24,13 +24,13 @@ def _seed() -> None:
 def make_agent() -> Callable[..., Agent]:
     """Debug agents, all with the same weights, and random ones in the heads that would start at zero."""
 
-    def make(name: str = "dreamer_pcp", **changes: object) -> Agent:
+    def make(name: str = "dreamer_pcp", changes: Mapping[str, Any] = {}) -> Agent:
         torch.manual_seed(0)
-        agent = build_agent(replace(AGENTS[name], **changes), reacher_task(), size="debug")
+        agent = build_agent(change(AGENTS[name], changes), reacher_task(), size="debug")
         with torch.no_grad():
             for parameter in agent.parameters():
                 parameter.add_(0.1 * torch.randn_like(parameter))
-        critic = agent.loss.value_loss
+        critic = agent.behaviour().loss.value_loss
         critic.target_value_model_params.data.copy_(critic.value_model_params.data)
         return agent
 

@@ -61,7 +61,7 @@ class Part(Settings):
         if name not in Part.registered[cls.kind]:
             load_plugins()
         if name not in Part.registered[cls.kind]:
-            raise SettingsError(f"{at}: unknown {cls.kind} {name!r}; there are {', '.join(cls.names())}")
+            raise SettingsError(f"{at} must be one of {', '.join(cls.names())}, got {name!r}")
         return from_dict(
             Part.registered[cls.kind][name], {key: one for key, one in settings.items() if key != "name"}, at
         )

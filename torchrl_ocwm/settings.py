@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, field, fields, is_dataclass
 from functools import cache
-from inspect import getdoc
+from inspect import cleandoc
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from torchrl_ocwm.errors import UserError
 
 T = TypeVar("T")
 
 
-class SettingsError(ValueError):
+class SettingsError(UserError, ValueError):
     """A setting has a value that it cannot have; the message names the setting, the value and what it can have."""
 
 
@@ -43,6 +45,7 @@ class Settings:
         SettingsError: for a value of another type, outside its range, or that :meth:`check` refuses.
 
     Examples:
+        >>> from dataclasses import dataclass
         >>> @dataclass(frozen=True)
         ... class Colour(Settings):
         ...     red: float = setting(0.5, at_least=0, at_most=1)
@@ -75,8 +78,8 @@ def read(hint: Any, value: Any, at: str) -> Any:
     Whole numbers are taken for real ones and lists for tuples; nothing else is converted.
 
     Args:
-        hint: The type: a number, ``bool``, ``str``, ``Literal``, ``None`` or a union, a tuple or dictionary of them, or a
-            settings class, given as itself or as a mapping of its fields.
+        hint: The type: a number, ``bool``, ``str``, ``Literal``, ``None`` or a union, a tuple or dictionary of them, or
+            a settings class, given as itself or as a mapping of its fields.
         value: The value.
         at: The setting's name, for the message.
 
@@ -132,7 +135,7 @@ def from_dict(kind: type[T], values: Any, at: str = "") -> T:
     known: dict[str, Field] = {one.name: one for one in fields(kind)}  # type: ignore[arg-type]
     odd = [name for name in values if name not in known]
     if odd:
-        raise SettingsError(f"there is no setting {where}{odd[0]}; there are {', '.join(known) or 'none'}")
+        raise SettingsError(f"{where}{odd[0]} is no setting; there are {', '.join(known) or 'none'}")
     hints = _hints(kind)
     given = {name: read(hints[name], value, where + name) for name, value in values.items()}
     lacking = [
@@ -161,8 +164,35 @@ def to_dict(settings: Any) -> Any:
     if not is_dataclass(settings):
         return settings
     known = settings.name_and_kind() if isinstance(settings, Settings) else None
-    name = {} if known is None else {"name": known[0]}
+    name: dict[str, Any] = {} if known is None else {"name": known[0]}
     return {**name, **{one.name: to_dict(getattr(settings, one.name)) for one in fields(settings)}}
+
+
+def change(settings: T, changes: Mapping[str, Any]) -> T:
+    """A copy of settings with some of them changed, by dotted names.
+
+    Args:
+        settings: The settings.
+        changes: Name → value; a part may be given by its name.
+
+    Raises:
+        SettingsError: for a setting that there is not, or a value that it cannot have.
+
+    Examples:
+        >>> from torchrl_ocwm.agents import AGENTS
+        >>> change(AGENTS["dreamer"], {"world_model.lambda_goal_position": 200}).world_model.lambda_goal_position
+        200.0
+    """
+    values = to_dict(settings)
+    for name, value in changes.items():
+        *path, last = name.split(".")
+        place = values
+        for step in path:
+            place = place.get(step)
+            if not isinstance(place, dict):
+                raise SettingsError(f"{name} is no setting")
+        place[last] = to_dict(value)
+    return from_dict(type(settings), values)
 
 
 def describe(hint: Any) -> str:
@@ -180,26 +210,29 @@ def describe(hint: Any) -> str:
         return " or ".join(describe(one) for one in arguments)
     if origin is tuple:
         return f"a list, each {describe(arguments[0])}"
-    return words.get(hint) or getattr(hint, "__name__", str(hint))
+    return words.get(hint) or str(getattr(hint, "__name__", hint))
 
 
 @cache
-def field_docs(kind: type) -> dict[str, str]:
-    """What the docstring of a settings class says of each field, each on one line.
+def field_docs(kind: Any) -> dict[str, str]:
+    """What the docstrings of a settings class and its bases say of each field, each on one line.
 
     Examples:
         >>> from torchrl_ocwm.agents import Learning
         >>> field_docs(Learning)["batch_size"]
         'Sequences per update.'
     """
-    section = (getdoc(kind) or "").partition("Args:\n")[2]
-    section = re.split(r"\n\S", section, maxsplit=1)[0]
-    entries = re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", section, re.MULTILINE)
-    return {name: " ".join(text.split()).replace("``", "`") for name, text in entries}
+    docs: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        section = cleandoc(base.__dict__.get("__doc__") or "").partition("Args:\n")[2]
+        section = re.split(r"\n\S", section, maxsplit=1)[0]
+        entries = re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", section, re.MULTILINE)
+        docs.update({name: " ".join(text.split()).replace("``", "`") for name, text in entries})
+    return docs
 
 
 @cache
-def _hints(kind: type) -> dict[str, Any]:
+def _hints(kind: Any) -> dict[str, Any]:
     return get_type_hints(kind)
 
 

@@ -11,6 +11,16 @@ from torchrl_ocwm.data.dataset import EpisodeDataset
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.envs.workspace import Workspace
 
+#: Changes to the size ``debug`` for each style.
+STYLES = {
+    "dreamer_v3": {},
+    "dreamer_v2": {
+        "architecture.style": "dreamer_v2",
+        "architecture.cnn_mults": (1, 2, 4, 8),
+        "architecture.gru_blocks": 8,
+    },
+}
+
 
 def reacher_task(image_size: int = 64) -> Task:
     """The shapes of Reacher."""

@@ -151,7 +151,7 @@ def test_errors_are_of_what_a_model_has(make_agent: Any) -> None:
     records = random_records(reacher_task(), 2, 5)
     flat = object_errors(make_agent("dreamer_pcp").model, records, 2)
     assert list(flat["imagined"]) == ["lower", "median", "upper"]
-    blind = make_agent("dreamer", observed=("proprio", "goal_position")).model
+    blind = make_agent("dreamer", {"world_model.observed": ("proprio", "goal_position")}).model
     assert object_errors(blind, records, 2)["imagined"] == {}
 
 

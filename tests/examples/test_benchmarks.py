@@ -48,7 +48,7 @@ def test_cost_of_agents_is_a_table_with_shares_that_add_up() -> None:
 # Gradients of focus_lcp are added up in another order; what that changes, the optimiser would magnify.
 @pytest.mark.parametrize(("name", "updates"), [("dreamer", 3), ("focus_lcp", 1)])
 def test_update_cut_into_parts_is_the_update(agent_cost: ModuleType, name: str, updates: int) -> None:
-    size = agent_cost.ALL_SIZES["debug"]
+    size = agent_cost.ALL_SIZES["debug"].learning
     batch = agent_cost.random_records(agent_cost.TASK, size.batch_size, size.slice_len)
     weights = []
     for cut in (False, True):
@@ -68,4 +68,4 @@ def test_sizes_of_the_peer(agent_cost: ModuleType) -> None:
     for size, figures in agent_cost.PEER.items():
         assert size in agent_cost.ALL_SIZES
         assert list(figures) == list(agent_cost.AGENTS)
-    assert agent_cost.PEER_SIZE.style == agent_cost.SIZES["paper"].style
+    assert agent_cost.PEER_SIZE.architecture.style == agent_cost.SIZES["paper"].architecture.style

@@ -15,6 +15,11 @@ from torchrl_ocwm.testing import random_records, reacher_task
 
 UNITS = WorkspaceUnits((-0.2, -0.2), (0.2, 0.2))
 
+MSE = {
+    "behaviours.reach.goal.distance": "mse",
+    "behaviours.reach.reward": {"name": "latent_similarity", "distance": "mse"},
+}
+
 
 def observation(number: int) -> TensorDict:
     """What a policy sees at the first step of ``number`` episodes."""
@@ -41,9 +46,9 @@ def test_mixed_goals_choose_for_each_element() -> None:
 @pytest.mark.parametrize("source", ["uniform", "frames", "mixed"])
 @pytest.mark.parametrize("name", ["dreamer_pcp", "focus_pcp", "focus_lcp"])
 def test_where_goals_come_from(make_agent: Any, records: TensorDict, name: str, source: str) -> None:
-    agent = make_agent(name, goal_source=source)
+    agent = make_agent(name, {"behaviours.reach.goals": source})
     _, after = agent.loss.model_loss(records)
-    goals = agent.loss.imagination_start(after["next"])["latent", "goal"]
+    goals = agent.behaviour().loss.imagination_start(after["next"])["latent", "goal"]
     key = "image_latent" if name == "focus_lcp" else "object_units"
     known = after["next", key].flatten(0, 1)
     known = UnitRMS()(known[:, 0]) if name == "focus_lcp" else known
@@ -110,14 +115,14 @@ def goals_of_every_kind(agent: Agent, records: TensorDict) -> dict[str, torch.Te
     policy = agent.policy()
     policy(observation(number))
     policy(observation(number).set("goal", TensorDict({"pixels": images}, [number])))
-    agent.actor(agent.loss.imagination_start(agent.loss.model_loss(records)[1]["next"]))
+    agent.actor(agent.behaviour().loss.imagination_start(agent.loss.model_loss(records)[1]["next"]))
     hook.remove()
     return dict(zip(("position", "image", "imagination"), seen, strict=True))
 
 
 @pytest.mark.parametrize("source", ["uniform", "frames", "mixed"])
 def test_goal_latents_of_every_kind_have_one_length(make_agent: Any, records: TensorDict, source: str) -> None:
-    agent = make_agent("focus_lcp", goal_source=source)
+    agent = make_agent("focus_lcp", {"behaviours.reach.goals": source})
     with torch.no_grad():  # the two encoders need not agree
         agent.model.positional_encoder.mlp.model[-1].weight.mul_(5)
     goals = goals_of_every_kind(agent, records)
@@ -135,7 +140,13 @@ def test_rewards_do_not_see_the_length_of_a_goal(distance: Any) -> None:
 
 
 def test_lengths_stay_where_training_and_reward_compare_them(make_agent: Any, records: TensorDict) -> None:
-    agent = make_agent("focus_lcp", latent_distance="mse", reward="latent_similarity")
+    agent = make_agent(
+        "focus_lcp",
+        {
+            "behaviours.reach.goal.distance": "mse",
+            "behaviours.reach.reward": {"name": "latent_similarity", "distance": "mse"},
+        },
+    )
     goals = goals_of_every_kind(agent, records)
     metres = observation(len(goals["position"]))["goal_position"]
     encoded = agent.model.positional_encoder(agent.model.units(metres).unsqueeze(-2))[:, 0]

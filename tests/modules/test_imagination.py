@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -9,7 +8,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_ocwm.agents import SIZES, Agent, build_agent
-from torchrl_ocwm.testing import reacher_task
+from torchrl_ocwm.settings import change
+from torchrl_ocwm.testing import STYLES, reacher_task
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_an_ordinary_rollout_works_too(agent: Agent) -> None:
 
 @pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
 def test_actions_beyond_the_bounds_count_as_clipped(style: Any) -> None:
-    agent = build_agent("dreamer_pcp", reacher_task(), replace(SIZES["debug"], style=style))
+    agent = build_agent("dreamer_pcp", reacher_task(), change(SIZES["debug"], STYLES[style]))
     start = agent.imagination.reset().expand(4).clone()
     wild = start.clone().set("action", torch.tensor([[5.0, -3.0]]).expand(4, 2))
     clipped = start.clone().set("action", torch.tensor([[1.0, -1.0]]).expand(4, 2))

@@ -1,18 +1,17 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
 from torchrl_ocwm.agents import AGENTS, SIZES, build_agent
 from torchrl_ocwm.modules.networks import make_image_decoder, make_image_encoder, make_mlp
-from torchrl_ocwm.testing import random_records, reacher_task
+from torchrl_ocwm.settings import change
+from torchrl_ocwm.testing import STYLES, random_records, reacher_task
 
 
 @pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
 def test_styles_build_an_agent_that_learns_from_a_batch(style: str) -> None:
-    size = replace(SIZES["debug"], style=style)
+    size = change(SIZES["debug"], STYLES[style])
     loss = build_agent("dreamer_pcp", reacher_task(), size).loss
     losses = loss(random_records(reacher_task(), 2, 3))
     assert all(value.isfinite() for name, value in losses.items() if name.startswith("loss_"))
@@ -35,7 +34,7 @@ def test_image_shapes(style: str) -> None:
 )
 def test_image_sizes_that_the_cnn_cannot_take(style: str, image_size: int, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        build_agent("dreamer_pcp", reacher_task(image_size), replace(SIZES["debug"], style=style))
+        build_agent("dreamer_pcp", reacher_task(image_size), change(SIZES["debug"], STYLES[style]))
 
 
 @pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
@@ -47,5 +46,6 @@ def test_outscale_zero_starts_at_zero(style: str) -> None:
 def test_every_size_builds(name: str) -> None:
     with torch.device("meta"):
         agent = build_agent(AGENTS["dreamer_pcp"], reacher_task(), name)
-    assert agent.model.belief == SIZES[name].belief
-    assert agent.model.state == SIZES[name].categoricals * SIZES[name].classes
+    architecture = SIZES[name].architecture
+    assert agent.model.belief == architecture.belief
+    assert agent.model.state == architecture.categoricals * architecture.classes

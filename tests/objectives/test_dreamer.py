@@ -19,7 +19,7 @@ from torchrl.objectives import DreamerV3ActorLoss, DreamerV3Loss, DreamerV3Value
 
 from torchrl_ocwm.agents import Agent
 from torchrl_ocwm.modules import UniformGoals
-from torchrl_ocwm.objectives import GoalConditionedDreamerLoss, WorldModelLoss
+from torchrl_ocwm.objectives import BehaviourLoss, GoalConditionedDreamerLoss, WorldModelLoss
 
 
 def network(module: Any, index: int = 0) -> nn.Module:
@@ -50,7 +50,7 @@ def torchrl_loss(agent: Agent, replay_weight: float) -> DreamerV3Loss:
             distribution_kwargs={"tanh_loc": False},
         ),
     )
-    critic = agent.loss.actor_loss.value_model
+    critic = agent.behaviour().loss.actor_loss.value_model
     value = TensorDictSequential(
         TensorDictModule(network(critic), keys, ["state_value_logits"]),
         TensorDictModule(network(critic, 1), ["state_value_logits"], ["state_value"]),
@@ -70,11 +70,10 @@ def torchrl_loss(agent: Agent, replay_weight: float) -> DreamerV3Loss:
 @pytest.mark.parametrize("replay_weight", [0.0, 0.3])
 def test_without_a_goal_it_is_torchrls_loss(make_agent: Any, records: TensorDict, replay_weight: float) -> None:
     """Same parameters, same noise, same numbers, same gradients."""
-    agent = make_agent("dreamer", lambda_object_position=1.0)
-    parts = agent.loss
-    ours = GoalConditionedDreamerLoss(
-        parts.model_loss, parts.actor_loss, parts.value_loss, replay_value_loss_weight=replay_weight
-    )
+    agent = make_agent("dreamer", {"world_model.lambda_object_position": 1.0})
+    parts = agent.behaviour().loss
+    behaviour = BehaviourLoss(parts.actor_loss, parts.value_loss, replay_value_loss_weight=replay_weight)
+    ours = GoalConditionedDreamerLoss(agent.loss.model_loss, behaviour, return_context=True)
     torch.manual_seed(1)
     got = ours(records)
     total(got).backward()
@@ -111,7 +110,7 @@ def test_actor_and_critic_leave_the_world_model_alone(make_agent: Any, records: 
     (losses["loss_actor"] + losses["loss_value"]).backward()
     assert gradient_norm(agent.model) == 0
     assert gradient_norm(agent.actor) > 0
-    assert sum(float(g.abs().sum()) for g in grads(agent.loss.value_loss.value_model_params)) > 0
+    assert sum(float(g.abs().sum()) for g in grads(agent.behaviour().loss.value_loss.value_model_params)) > 0
 
 
 def grads(params: Any) -> list[Tensor]:
@@ -122,7 +121,7 @@ def test_actor_loss_leaves_the_critic_alone(make_agent: Any, records: TensorDict
     agent = make_agent()
     agent.loss(records)["loss_actor"].backward()
     assert gradient_norm(agent.actor) > 0
-    assert not any(float(g.abs().sum()) for g in grads(agent.loss.value_loss.value_model_params))
+    assert not any(float(g.abs().sum()) for g in grads(agent.behaviour().loss.value_loss.value_model_params))
 
 
 def test_critic_loss_leaves_the_actor_alone(make_agent: Any, records: TensorDict) -> None:
@@ -135,7 +134,7 @@ def test_imagined_reward_teaches_the_actor_through_the_dynamics(make_agent: Any,
     """The gradient of the imagined reward alone, without critic and entropy, reaches the actor."""
     agent = make_agent()
     latent = agent.model.records()(records)["next"].select("state", "belief")
-    start = agent.loss.imagination_start(latent)
+    start = agent.behaviour().loss.imagination_start(latent)
     rollout = agent.imagination.rollout(3, agent.actor, auto_reset=False, tensordict=start, break_when_any_done=False)
     rollout["next", "reward"][:, -1].sum().backward()
     assert gradient_norm(agent.actor) > 0
@@ -144,7 +143,7 @@ def test_imagined_reward_teaches_the_actor_through_the_dynamics(make_agent: Any,
 def test_every_imagined_start_has_a_goal_of_its_own(make_agent: Any, records: TensorDict) -> None:
     agent = make_agent()
     latent = agent.model.records()(records)["next"].select("state", "belief")
-    start = agent.loss.imagination_start(latent)
+    start = agent.behaviour().loss.imagination_start(latent)
     assert not any(value.requires_grad for value in start.values(True, True))
     goals = start["latent", "goal"]
     assert goals.shape == (12, 2)
@@ -155,7 +154,7 @@ def test_every_imagined_start_has_a_goal_of_its_own(make_agent: Any, records: Te
 def test_the_goal_stays_through_imagination(make_agent: Any, records: TensorDict) -> None:
     agent = make_agent()
     latent = agent.model.records()(records)["next"].select("state", "belief")
-    start = agent.loss.imagination_start(latent)
+    start = agent.behaviour().loss.imagination_start(latent)
     rollout = agent.imagination.rollout(3, agent.actor, auto_reset=False, tensordict=start, break_when_any_done=False)
     goal = start["latent", "goal"].unsqueeze(1).expand(-1, 3, -1)
     torch.testing.assert_close(rollout["latent", "goal"], goal, rtol=0, atol=0)
@@ -165,7 +164,7 @@ def test_the_goal_stays_through_imagination(make_agent: Any, records: TensorDict
 def test_imagined_reward_is_the_distance_of_the_decoded_position(make_agent: Any, records: TensorDict) -> None:
     agent = make_agent()
     latent = agent.model.records()(records)["next"].select("state", "belief")
-    start = agent.loss.imagination_start(latent)
+    start = agent.behaviour().loss.imagination_start(latent)
     rollout = agent.imagination.rollout(3, agent.actor, auto_reset=False, tensordict=start, break_when_any_done=False)
     after = rollout["next", "latent"]
     decoded = agent.model.vector_decoders["object_position"](after["state"], after["belief"])
@@ -174,11 +173,9 @@ def test_imagined_reward_is_the_distance_of_the_decoded_position(make_agent: Any
 
 
 def test_replay_value_needs_recorded_rewards(make_agent: Any) -> None:
-    loss = make_agent().loss
+    loss = make_agent().behaviour().loss
     with pytest.raises(ValueError, match="set it to 0 or drop the goal source"):
-        GoalConditionedDreamerLoss(
-            loss.model_loss, loss.actor_loss, loss.value_loss, goal_source=UniformGoals(2), replay_value_loss_weight=0.3
-        )
+        BehaviourLoss(loss.actor_loss, loss.value_loss, goal_source=UniformGoals(2), replay_value_loss_weight=0.3)
 
 
 def test_set_keys_nested(make_agent: Any, records: TensorDict) -> None:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -13,7 +12,8 @@ from torchrl_ocwm.agents import SIZES, build_agent
 from torchrl_ocwm.modules import UnitRMS
 from torchrl_ocwm.objectives import FOCUSModelLoss, mask_nll, object_reconstruction, positional_latent_loss
 from torchrl_ocwm.objectives.focus import visible_position_reconstruction
-from torchrl_ocwm.testing import reacher_task
+from torchrl_ocwm.settings import change
+from torchrl_ocwm.testing import STYLES, reacher_task
 
 
 @pytest.fixture
@@ -125,7 +125,7 @@ BODY = {"encoder", "prior", "posterior", "extractor"}
 def test_l_pos_moves_what_it_should_and_nothing_else(
     make_agent: Any, records: TensorDict, gradient: str, parts: set[str]
 ) -> None:
-    agent = make_agent("focus_lcp", positional_gradient=gradient)
+    agent = make_agent("focus_lcp", {"behaviours.reach.goal.gradient": gradient})
     agent.loss.model_loss(records)[0]["loss_model_positional"].backward()
     assert reached(agent) == parts
 
@@ -140,7 +140,7 @@ def test_what_images_alone_train(make_agent: Any, records: TensorDict, part: str
 
 @pytest.mark.usefixtures("no_noise")
 def test_image_losses_frame_by_frame(make_agent: Any, records: TensorDict) -> None:
-    agent = make_agent("focus_lcp", lambda_object_position=7.0)
+    agent = make_agent("focus_lcp", {"world_model.lambda_object_position": 7.0})
     records["next", "object_visible"][1, 2] = False
     losses, after = agent.loss.model_loss(records)
     model, latents, positions = agent.model, [], []
@@ -179,7 +179,7 @@ def test_object_terms_train_the_rssm(make_agent: Any, records: TensorDict, part:
 def test_latent_reward_teaches_the_actor_through_the_dynamics(make_agent: Any, records: TensorDict) -> None:
     agent = make_agent("focus_lcp")
     latent = agent.model.records()(records)["next"].select("state", "belief")
-    start = agent.loss.imagination_start(latent)
+    start = agent.behaviour().loss.imagination_start(latent)
     rollout = agent.imagination.rollout(3, agent.actor, auto_reset=False, tensordict=start, break_when_any_done=False)
     rollout["next", "reward"][:, -1].sum().backward()
     assert moved(agent.actor)
@@ -188,7 +188,7 @@ def test_latent_reward_teaches_the_actor_through_the_dynamics(make_agent: Any, r
 def test_goal_latents_are_encoded_positions(make_agent: Any, records: TensorDict) -> None:
     agent = make_agent("focus_lcp")
     latent = agent.model.records()(records)["next"].select("state", "belief")
-    start = agent.loss.imagination_start(latent)
+    start = agent.behaviour().loss.imagination_start(latent)
     goals = agent.model.positional_encoder(start["goal_units"].unsqueeze(-2))[:, 0]
     torch.testing.assert_close(start["latent", "goal"], UnitRMS()(goals))
     assert not start["latent", "goal"].requires_grad
@@ -216,7 +216,7 @@ def test_weights_and_keys(make_agent: Any, records: TensorDict) -> None:
 
 @pytest.mark.parametrize("name", ["focus", "focus_pcp", "focus_lcp"])
 def test_update_with_the_layers_of_the_paper(records: TensorDict, name: str) -> None:
-    size = replace(SIZES["debug"], style="dreamer_v2")
+    size = change(SIZES["debug"], STYLES["dreamer_v2"])
     agent = build_agent(name, reacher_task(), size)
     losses = agent.loss(records)
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()

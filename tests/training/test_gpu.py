@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,6 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_ocwm.agents import SIZES, build_agent
+from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records, reacher_task
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_stepper
@@ -23,7 +23,7 @@ pytestmark = [
 def losses(name: str, updates: int = 3, **settings: Any) -> list[TensorDict]:
     """Losses of the first updates of a debug agent on one batch."""
     torch.manual_seed(0)
-    agent = build_agent(name, reacher_task(), replace(SIZES["debug"], batch_size=4)).cuda()
+    agent = build_agent(name, reacher_task(), change(SIZES["debug"], {"learning.batch_size": 4})).cuda()
     batch = random_records(reacher_task(), 4, 8).cuda()
     stepper = make_stepper(agent, Training(device="cuda", **settings))
     if any(stepper.resolve(torch.device("cuda"))):

@@ -17,6 +17,7 @@ import torchrl_ocwm
 from torchrl_ocwm.agents import SIZES, Agent, build_agent
 from torchrl_ocwm.agents.checkpoint import describe, rebuild
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
+from torchrl_ocwm.settings import SettingsError, change
 from torchrl_ocwm.testing import random_dataset, reacher_task
 from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.settings import Training
@@ -144,18 +145,18 @@ class TestOtherReleases:
 
     def test_settings_that_came_later_take_their_defaults(self) -> None:
         description = self.description()
-        del description["agent"]["lambda_positional"], description["size"]["gamma"]
+        del description["agent"]["behaviours"]["reach"]["goal"]["weight"], description["size"]["learning"]["gamma"]
         agent = rebuild(description)
-        assert (agent.config.lambda_positional, agent.size.gamma) == (1.0, 0.99)
+        assert (agent.config.behaviours["reach"].goal.weight, agent.size.learning.gamma) == (1.0, 0.99)
 
     def test_settings_that_are_gone(self) -> None:
         description = self.description()
         description["agent"]["colour"] = "red"
-        del description["size"]["belief"]
-        with pytest.raises(CheckpointError, match=r"another release: AgentConfig differs in \['colour'\]"):
+        del description["size"]["architecture"]["belief"]
+        with pytest.raises(SettingsError, match=r"agent\.colour is no setting"):
             rebuild(description)
         del description["agent"]["colour"]
-        with pytest.raises(CheckpointError, match=r"another release: Size differs in \['belief'\]"):
+        with pytest.raises(SettingsError, match=r"size\.architecture\.belief is missing"):
             rebuild(description)
 
 
@@ -163,7 +164,7 @@ class TestBadInput:
     def test_checkpoint_of_another_agent(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         file = train(fresh("dreamer"), dataset, tmp_path)
         before = file.read_bytes()
-        with pytest.raises(CheckpointError, match=r"another agent \(agent\.goal: none there, position here"):
+        with pytest.raises(CheckpointError, match=r"reach\.goal\.name: none there, position here"):
             train(fresh(), dataset, tmp_path)
         assert file.read_bytes() == before
 
@@ -173,7 +174,7 @@ class TestBadInput:
             train(fresh(), other, tmp_path / "run")
 
     def test_sequences_longer_than_episodes(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
-        agent = build_agent("dreamer_pcp", reacher_task(), replace(SIZES["debug"], slice_len=21))
+        agent = build_agent("dreamer_pcp", reacher_task(), change(SIZES["debug"], {"learning.slice_len": 21}))
         with pytest.raises(DatasetError, match="cannot cut sequences of 21 frames, the shortest episode has 20"):
             train(agent, dataset, tmp_path)
 

@@ -36,14 +36,14 @@ def test_mixed_precision_works_on_a_cpu() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "changes"), [("dreamer", {}), ("dreamer_pcp", {}), ("focus_lcp", {"goal_source": "mixed"})]
+    ("name", "changes"), [("dreamer", {}), ("dreamer_pcp", {}), ("focus_lcp", {"behaviours.reach.goals": "mixed"})]
 )
 @pytest.mark.usefixtures("no_noise")
 def test_update_compiles_into_one_graph(make_agent: Any, records: TensorDict, name: str, changes: dict) -> None:
     """Forward and backward without a graph break, to the same losses and gradients."""
     records, results = records[:, :3], []
     for compiled in (False, True):
-        agent = make_agent(name, **changes)
+        agent = make_agent(name, changes)
         step = make_stepper(agent, Training())._forward_backward
         with one_graph():
             losses = torch.compile(step, fullgraph=True, backend="eager")(records) if compiled else step(records)

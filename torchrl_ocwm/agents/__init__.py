@@ -5,7 +5,13 @@ from torchrl_ocwm.agents.behaviour import LearntBehaviour
 from torchrl_ocwm.agents.build import build_agent
 from torchrl_ocwm.agents.checkpoint import load_agent
 from torchrl_ocwm.agents.config import AgentConfig, Behaviour, Learning, Size
-from torchrl_ocwm.agents.goal_sources import EnvironmentGoals, FrameGoalSource, GoalSource, MixedGoalSource, UniformGoalSource
+from torchrl_ocwm.agents.goal_sources import (
+    EnvironmentGoals,
+    FrameGoalSource,
+    GoalSource,
+    MixedGoalSource,
+    UniformGoalSource,
+)
 from torchrl_ocwm.agents.goals import Goal, GoalEncoding, NoGoal, ObjectLatent, Position
 from torchrl_ocwm.agents.optimizers import Adam, DreamerV3, OptimizerPart
 from torchrl_ocwm.agents.presets import AGENTS, SIZES, agent_name

@@ -6,7 +6,12 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 from torch import Tensor, nn
 
 from torchrl_ocwm.agents.behaviour import LearntBehaviour
@@ -143,7 +148,9 @@ def _merge(needs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     for one in needs:
         for name, value in one.items():
             if merged.setdefault(name, value) != value:
-                raise SettingsError(f"two behaviours need another {name} of the world model: {merged[name]} and {value}")
+                raise SettingsError(
+                    f"two behaviours need another {name} of the world model: {merged[name]} and {value}"
+                )
     return merged
 
 

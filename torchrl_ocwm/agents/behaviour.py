@@ -147,8 +147,8 @@ def _check_reward(config: Behaviour, reward: ImaginedReward, features: int) -> N
     judges = GOAL in reward.module.in_keys
     if judges != bool(features):
         raise SettingsError(
-            f"reward={_name(config.reward)} does not go with goal={_name(config.goal)}: an imagined reward has to judge "
-            "by the goal that the policy sees, and by no other"
+            f"reward={_name(config.reward)} does not go with goal={_name(config.goal)}: an imagined reward has to "
+            "judge by the goal that the policy sees, and by no other"
         )
 
 

@@ -10,13 +10,14 @@ from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from torchrl_ocwm.agents.agent import Agent, Policy
 from torchrl_ocwm.agents.config import AgentConfig, Size
+from torchrl_ocwm.agents.presets import flat
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.settings import from_dict, to_dict
 
 
 def describe(agent: Agent) -> dict[str, Any]:
     """What it takes to build an agent again; fits in JSON."""
-    return {"agent": to_dict(agent.config), "size": to_dict(agent.size), "task": agent.task.to_dict()}
+    return {"agent": to_dict(agent.config), "size": to_dict(agent.size), "task": to_dict(agent.task)}
 
 
 def rebuild(description: dict[str, Any]) -> Agent:
@@ -76,19 +77,11 @@ def check_same_agent(agent: Agent, path: Path) -> None:
     Raises:
         CheckpointError: with what differs.
     """
-    there, here = read_description(path), describe(agent)
+    there, here = flat(read_description(path)), flat(describe(agent))
     differences = [
-        f"{part}.{key}: {there[part].get(key)} there, {value} here"
-        for part, values in here.items()
-        for key, value in _plain(values).items()
-        if _plain(there[part]).get(key) != value
+        f"{name}: {there.get(name)} there, {here.get(name)} here"
+        for name in dict.fromkeys([*here, *there])
+        if there.get(name) != here.get(name)
     ]
     if differences:
         raise CheckpointError(f"{path}: a checkpoint of another agent ({'; '.join(differences)})")
-
-
-def _plain(value: Any) -> Any:
-    """Tuples as lists, as JSON has them."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value

@@ -12,9 +12,10 @@ from torchrl_ocwm.agents.optimizers import Adam, DreamerV3
 from torchrl_ocwm.agents.rewards import LatentChord, PositionDistance
 from torchrl_ocwm.agents.world_models import Flat, ObjectCentric
 from torchrl_ocwm.modules.architecture import Architecture
+from torchrl_ocwm.modules.world_model import VectorName
 from torchrl_ocwm.settings import to_dict
 
-_WITH_GOAL = ("proprio", "object_position", "goal_position")
+_WITH_GOAL: tuple[VectorName, ...] = ("proprio", "object_position", "goal_position")
 _PCP = Behaviour(goal=Position(), reward=PositionDistance(), goals=UniformGoalSource())
 _LCP = Behaviour(goal=ObjectLatent(weight=100.0), reward=LatentChord(), goals=UniformGoalSource())
 
@@ -112,4 +113,6 @@ def flat(values: Mapping[str, Any], at: str = "") -> dict[str, Any]:
 def _difference(here: dict[str, Any], there: dict[str, Any]) -> dict[str, Any]:
     """What is here but not there or otherwise, and as ``None`` what is only there."""
     names = dict.fromkeys([*here, *there])
-    return {name: here.get(name) for name in names if here.get(name) != there.get(name) or (name in here) != (name in there)}
+    return {
+        name: here.get(name) for name in names if here.get(name) != there.get(name) or (name in here) != (name in there)
+    }

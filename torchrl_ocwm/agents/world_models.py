@@ -39,6 +39,15 @@ class WorldModelPart(Part, kind="world_model"):
 
 @dataclass(frozen=True)
 class _Observing(WorldModelPart):
+    """What all our world models observe, and what it weighs.
+
+    Args:
+        observed: Vectors that the world model sees and reconstructs, beside the image.
+        lambda_proprio: Weight of the reconstruction of proprioception.
+        lambda_object_position: Weight of the reconstruction of the object positions.
+        lambda_goal_position: Weight of the reconstruction of the goal position.
+    """
+
     observed: tuple[VectorName, ...] = ("proprio", "object_position")
     lambda_proprio: float = setting(1.0, at_least=0)
     lambda_object_position: float = setting(200.0, at_least=0)
@@ -66,7 +75,7 @@ class _Observing(WorldModelPart):
             **asdict(architecture),
         }
 
-    def _weights(self, lambda_dynamic: float) -> dict[str, float]:
+    def _weights(self, lambda_dynamic: float) -> dict[str, Any]:
         names = ("lambda_proprio", "lambda_object_position", "lambda_goal_position")
         return {"lambda_dynamic": lambda_dynamic, **{name: getattr(self, name) for name in names}}
 
@@ -74,14 +83,7 @@ class _Observing(WorldModelPart):
 @register("flat")
 @dataclass(frozen=True)
 class Flat(_Observing):
-    """One latent state for the whole scene (Dreamer).
-
-    Args:
-        observed: Vectors that the world model sees and reconstructs, beside the image.
-        lambda_proprio: Weight of the reconstruction of proprioception.
-        lambda_object_position: Weight of the reconstruction of the object positions.
-        lambda_goal_position: Weight of the reconstruction of the goal position.
-    """
+    """One latent state for the whole scene (Dreamer)."""
 
     def build(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> FlatWorldModel:
         """A world model with one latent."""
@@ -98,14 +100,7 @@ class Flat(_Observing):
 @register("object")
 @dataclass(frozen=True)
 class ObjectCentric(_Observing):
-    """A latent for each object and the background too, from which masks, colours and positions are decoded (FOCUS).
-
-    Args:
-        observed: Vectors that the world model sees and reconstructs, beside the image.
-        lambda_proprio: Weight of the reconstruction of proprioception.
-        lambda_object_position: Weight of the reconstruction of the object positions.
-        lambda_goal_position: Weight of the reconstruction of the goal position.
-    """
+    """A latent for each object and the background too, from which masks, colours and positions are decoded (FOCUS)."""
 
     def build(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> ObjectWorldModel:
         """A world model with object latents, and a positional encoder if a goal needs one."""
@@ -114,5 +109,5 @@ class ObjectCentric(_Observing):
 
     def loss(self, model: WorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> FOCUSModelLoss:
         """What trains it."""
-        positional = needs.get("positional_encoder", {})
+        positional: dict[str, Any] = needs.get("positional_encoder", {})
         return FOCUSModelLoss(model.records(), **positional, **self._weights(lambda_dynamic))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
@@ -10,27 +12,69 @@ from typing import Any, NamedTuple
 import torch
 from torchrl.envs import EnvBase, InitTracker, ParallelEnv, TransformedEnv
 
+from torchrl_ocwm.envs.options import CubeMoveOptions, EnvOptions, MetaWorldOptions
 from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.settings import Settings, SettingsError, from_dict
 
 
 class Environment(NamedTuple):
-    """One row: gymnasium id, where its class is, and the extra that installs its simulator."""
+    """One row.
+
+    Args:
+        id: Its gymnasium id.
+        entry_point: Where its class is, ``module:Class``.
+        extra: What installs its simulator; none: nothing has to be installed.
+        module: What is there when that is installed.
+        options: What can be chosen of it.
+    """
 
     id: str
     entry_point: str
-    extra: str
-    module: str
+    extra: str = ""
+    module: str = "gymnasium"
+    options: type[EnvOptions] = EnvOptions
 
 
 #: Short name → environment.
 ENVIRONMENTS = {
     "reacher": Environment("ocwm/Reacher-v0", "torchrl_ocwm.envs.reacher:Reacher", "dm-control", "dm_control"),
-    "cube_move": Environment("ocwm/CubeMove-v0", "torchrl_ocwm.envs.cube_move:CubeMove", "robosuite", "robosuite"),
-    "shelf_place": Environment(
-        "ocwm/ShelfPlace-v0", "torchrl_ocwm.envs.meta_world:ShelfPlace", "metaworld", "metaworld"
+    "cube_move": Environment(
+        "ocwm/CubeMove-v0", "torchrl_ocwm.envs.cube_move:CubeMove", "robosuite", "robosuite", CubeMoveOptions
     ),
-    "pick_place": Environment("ocwm/PickPlace-v0", "torchrl_ocwm.envs.meta_world:PickPlace", "metaworld", "metaworld"),
+    "shelf_place": Environment(
+        "ocwm/ShelfPlace-v0", "torchrl_ocwm.envs.meta_world:ShelfPlace", "metaworld", "metaworld", MetaWorldOptions
+    ),
+    "pick_place": Environment(
+        "ocwm/PickPlace-v0", "torchrl_ocwm.envs.meta_world:PickPlace", "metaworld", "metaworld", MetaWorldOptions
+    ),
 }
+
+
+@dataclass(frozen=True)
+class EnvChoice(Settings):
+    """An environment by name, and its options.
+
+    Args:
+        name: Name of the environment.
+        options: Passed to the environment; one made from a dataset or a checkpoint has the options stored there.
+
+    Raises:
+        SettingsError: for an unknown name, or options that the environment does not have.
+
+    Examples:
+        >>> EnvChoice("reacher", {"horizon": 0})
+        Traceback (most recent call last):
+        torchrl_ocwm.settings.SettingsError: options.horizon must be at least 1, got 0
+    """
+
+    name: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def check(self) -> None:
+        """Options are those of the environment."""
+        if self.name not in ENVIRONMENTS:
+            raise SettingsError(f"name must be one of {', '.join(ENVIRONMENTS)}, got {self.name!r}")
+        from_dict(ENVIRONMENTS[self.name].options, self.options, "options")
 
 
 def make_env(

@@ -124,8 +124,7 @@ class BehaviourLoss(LossModule):
         if self.goal_source is None:
             return start.reshape(-1)
         with torch.no_grad():
-            goals = self.goal_source(start.copy().update(frames.select(*self._source_keys())))
-        return start.set(("latent", "goal"), goals.get(("latent", "goal"))).reshape(-1)
+            return self.goal_source(start.update(frames.select(*self._source_keys()))).reshape(-1)
 
     def _source_keys(self) -> list[NestedKey]:
         """What the goal source reads beside state and belief."""
@@ -188,6 +187,8 @@ class GoalConditionedDreamerLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    model_loss: DreamerV3ModelLoss
+    behaviours: nn.ModuleDict
 
     def __init__(
         self,
@@ -198,8 +199,9 @@ class GoalConditionedDreamerLoss(LossModule):
     ) -> None:
         super().__init__()
         self.model_loss = model_loss
-        single = isinstance(behaviours, BehaviourLoss)
-        self.behaviours = nn.ModuleDict({"behaviour": behaviours} if single else behaviours)
+        self.behaviours = nn.ModuleDict(
+            {"behaviour": behaviours} if isinstance(behaviours, BehaviourLoss) else behaviours
+        )
         self.return_context = return_context
 
     def set_keys(self, **kwargs: NestedKey) -> None:
@@ -224,6 +226,9 @@ class GoalConditionedDreamerLoss(LossModule):
     def forward(self, sample: TensorDictBase) -> TensorDictBase:
         """Losses and metrics of records ``[B, T]``, scalars."""
         losses, records = self.model_loss(sample)
+        reward = unravel_key(("next", self.model_loss.tensor_keys.reward))
+        if (recorded := sample.get(reward, None)) is not None:
+            records.set(reward, recorded)  # a world model writes its prediction in the same place
         for behaviour in self.behaviours.values():
             more = behaviour(records)
             if twice := set(losses.keys()) & set(more.keys()):

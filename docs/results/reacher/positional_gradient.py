@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 # Side and weight. The weight is nothing to an encoder alone: the optimiser divides by the size of gradients.
+GOAL = "agent.behaviours.reach.goal"
 CHOICES = (("encoder", 1), ("latent", 1), ("both", 1), ("both", 10), ("both", 100))
 
 
@@ -30,7 +31,7 @@ def measure(side: str, weight: int, seed: int, arguments: argparse.Namespace) ->
     output = Path(arguments.output) / f"{side}_{weight}" / f"seed_{seed}"
     updates, dataset = f"training.updates={arguments.updates}", f"dataset={arguments.dataset}"
     settings = ["agent=focus_lcp", "env=reacher", "size=cpu", "training.threads=1", "training.video_interval=0"]
-    settings += [f"agent.positional_gradient={side}", f"agent.lambda_positional={weight}"]
+    settings += [f"{GOAL}.gradient={side}", f"{GOAL}.weight={weight}"]
     run("train_offline", *settings, updates, dataset, f"training.seed={seed}", f"output={output}")
     looked_at = [f"checkpoint={output}/checkpoint.zip", dataset, "video_sequences=0", f"output={output}/diagnosis"]
     run("diagnose", *looked_at)

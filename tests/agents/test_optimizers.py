@@ -1,33 +1,44 @@
 """Optimisers by name."""
 
-from dataclasses import replace
-from typing import get_args, get_type_hints
-
 import pytest
 import torch
 from torchrl.trainers.algorithms import DreamerV3Optimizer
 
-from torchrl_ocwm.agents import SIZES, Size, build_agent
+from torchrl_ocwm.agents import SIZES, Adam, DreamerV3, build_agent
+from torchrl_ocwm.agents.optimizers import ClippedAdam
+from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records, reacher_task
-from torchrl_ocwm.training.optimizer import OPTIMIZERS, ClippedAdam, make_optimizer
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_stepper
 
 
-def test_every_choice_has_an_optimizer() -> None:
-    assert set(OPTIMIZERS) == set(get_args(get_type_hints(Size)["optimizer"]))
-
-
 @pytest.mark.parametrize(("name", "kind"), [("dreamer_v3", DreamerV3Optimizer), ("adam", ClippedAdam)])
 def test_each_group_has_its_learning_rate(name: str, kind: type) -> None:
-    size = replace(SIZES["debug"], optimizer=name, model_lr=1.0, actor_lr=2.0, value_lr=3.0)
-    agent = build_agent("focus_lcp", reacher_task(), size)
-    optimizer = make_optimizer(agent)
+    rates = {"learning.model_lr": 1.0, "learning.actor_lr": 2.0, "learning.value_lr": 3.0}
+    agent = build_agent("focus_lcp", reacher_task(), change(SIZES["debug"], {"learning.optimizer": name, **rates}))
+    optimizer = agent.size.learning.optimizer.build(agent.parameter_groups())
     assert type(optimizer) is kind
     model, actor, critic = optimizer.param_groups
     assert [group["lr"] for group in (model, actor, critic)] == [1.0, 2.0, 3.0]
     assert {id(p) for p in model["params"]} == {id(p) for p in agent.model.parameters()}
     assert {id(p) for p in actor["params"]} == {id(p) for p in agent.actor.parameters()}
+
+
+def test_settings_reach_the_optimizers() -> None:
+    groups = [{"params": [torch.nn.Parameter(torch.ones(2))], "lr": 0.5}]
+    adam = Adam(max_norm=7.0, eps=0.25, decay=0.1).build(groups)
+    assert (adam.max_norm, adam.defaults["eps"], adam.param_groups[0]["weight_decay"]) == (7.0, 0.25, 0.2)
+    assert DreamerV3(warmup=9).build(groups).defaults["warmup_steps"] == 9
+
+
+def test_a_learning_rate_of_zero_trains_nothing() -> None:
+    size = change(SIZES["debug"], {"learning.optimizer": "adam", "learning.model_lr": 0})
+    agent = build_agent("dreamer_pcp", reacher_task(), size)
+    before = [parameter.detach().clone() for parameter in agent.model.parameters()]
+    actor = [parameter.detach().clone() for parameter in agent.actor.parameters()]
+    make_stepper(agent, Training()).step(None, random_records(agent.task, 2, 8))
+    assert all(torch.equal(p, old) for p, old in zip(agent.model.parameters(), before, strict=True))
+    assert not all(torch.equal(p, old) for p, old in zip(agent.actor.parameters(), actor, strict=True))
 
 
 def test_clipped_adam_step_by_step() -> None:
@@ -59,14 +70,9 @@ def test_clipped_adam_step_by_step() -> None:
             torch.testing.assert_close(parameter.detach(), weight, rtol=1e-4, atol=1e-5)
 
 
-def test_warm_up_needs_an_optimizer_that_has_one() -> None:
-    with pytest.raises(ValueError, match=r"optimizer='adam' has no warm-up; set warmup=0, got 5"):
-        replace(SIZES["paper"], warmup=5)
-
-
 def test_an_update_with_adam_moves_all_three() -> None:
-    agent = build_agent("focus_pcp", reacher_task(), replace(SIZES["debug"], optimizer="adam"))
-    parts = {"model": agent.model, "actor": agent.actor, "critic": agent.loss.value_loss.value_model_params}
+    agent = build_agent("focus_pcp", reacher_task(), change(SIZES["debug"], {"learning.optimizer": "adam"}))
+    parts = {"model": agent.model, "actor": agent.actor, "critic": agent.behaviour().loss.value_loss.value_model_params}
     before = {name: [p.detach().clone() for p in part.parameters()] for name, part in parts.items()}
     make_stepper(agent, Training()).step(None, random_records(agent.task, 2, 8))
     for name, part in parts.items():

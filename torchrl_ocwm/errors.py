@@ -1,0 +1,10 @@
+"""Errors that whoever runs a recipe can mend."""
+
+from __future__ import annotations
+
+
+class UserError(Exception):
+    """Something that the user can mend; the message says what is wrong and how. Recipes show it on one line.
+
+    All other errors are ours, and show their traceback.
+    """

@@ -1,0 +1,111 @@
+"""Settings classes as Hydra configurations: the classes are the one truth, and Hydra's store is filled from them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any, TypeVar, get_type_hints
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from torchrl.checkpoint import CheckpointError
+
+from torchrl_ocwm.agents import AGENTS, SIZES
+from torchrl_ocwm.envs.registry import ENVIRONMENTS
+from torchrl_ocwm.errors import UserError
+from torchrl_ocwm.parts import load_plugins
+from torchrl_ocwm.settings import field_docs, from_dict, to_dict
+
+T = TypeVar("T")
+_QUIET = ("job_logging", "hydra_logging")
+
+
+def recipe(
+    name: str, groups: Mapping[str, str] | None = None, **more: Any
+) -> Callable[[Callable[[T], None]], Callable[[], None]]:
+    """Make a function of settings the main function of a script that is configured with Hydra.
+
+    The argument of the function is annotated with its settings class. Errors that a user can mend end the script with
+    one line; all others show their traceback (``HYDRA_FULL_ERROR=1`` shows it for all).
+
+    Args:
+        name: Name of the recipe.
+        groups: Groups of options that it takes (``agent``, ``size``, ``env``), each with its default.
+        more: Settings of Hydra itself.
+    """
+
+    def decorate(function: Callable[[T], None]) -> Callable[[], None]:
+        """The script's main function."""
+        kind: type[T] = next(iter(get_type_hints(function).values()))
+
+        def guarded(config: DictConfig) -> None:
+            try:
+                function(from_dict(kind, OmegaConf.to_container(config, resolve=True, throw_on_missing=True)))
+            except (UserError, CheckpointError, OmegaConfBaseException) as error:
+                if os.environ.get("HYDRA_FULL_ERROR") == "1":
+                    raise
+                sys.exit(f"{type(error).__name__}: {error}")
+
+        def main() -> None:
+            store_options()
+            ConfigStore.instance().store(name, _schema(kind, groups or {}, more))
+            hydra.main(version_base="1.3", config_path=None, config_name=name)(guarded)()
+
+        return main
+
+    return decorate
+
+
+def store_options() -> None:
+    """Put agents, sizes and environments into Hydra's store, those of plugins too."""
+    load_plugins()
+    store = ConfigStore.instance()
+    for group, rows in (("agent", AGENTS), ("size", SIZES)):
+        for name, row in rows.items():
+            store.store(name, to_dict(row), group=group)
+    for name, environment in ENVIRONMENTS.items():
+        store.store(name, {"name": name, "options": to_dict(environment.options())}, group="env")
+
+
+def help_lines(kind: type, at: str = "") -> Iterator[str]:
+    """What each setting of a class is, with its default: one line each.
+
+    Examples:
+        >>> from torchrl_ocwm.training.settings import Training
+        >>> next(help_lines(Training, "training"))
+        'training.updates=10000: Updates of model, actor and critic in all.'
+    """
+    hints, docs = get_type_hints(kind), field_docs(kind)
+    for one in fields(kind):
+        name = f"{at}.{one.name}" if at else one.name
+        if is_dataclass(hints[one.name]):
+            yield from help_lines(hints[one.name], name)
+        else:
+            value = f"={_shown(one.default)}" if one.default is not MISSING else ""
+            yield f"{name}{value}: {docs.get(one.name, '')}"
+
+
+def _schema(kind: type, groups: Mapping[str, str], more: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration of a recipe: its groups, and all other settings with their defaults."""
+    plain = {one.name: _default(one) for one in fields(kind) if one.name not in groups}
+    defaults: list[Any] = [{group: choice} for group, choice in groups.items()]
+    quiet = [{f"override hydra/{part}": "none"} for part in _QUIET]
+    text = "\n".join(help_lines(kind)).replace("$", "")
+    own = {"run": {"dir": "."}, "output_subdir": None, "help": {"header": f"Settings:\n{text}\n"}, **more}
+    return {"defaults": [*defaults, "_self_", *quiet], **plain, "hydra": own}
+
+
+def _default(one: Any) -> Any:
+    if one.default is not MISSING:
+        return to_dict(one.default)
+    return "???" if one.default_factory is MISSING else to_dict(one.default_factory())
+
+
+def _shown(value: Any) -> str:
+    """A value as the command line takes it."""
+    plain = to_dict(value)
+    return {"None": "null", "True": "true", "False": "false"}.get(str(plain), str(plain))
