@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
 
 from torchrl_ocwm.agents.config import check_choices
+
+#: What a run that goes on may do with a setting: keep it as it was, change it when told so, change it freely.
+Resume = Literal["same", "asked", "free"]
+
+
+def setting(default: Any, *, resume: Resume) -> Any:
+    """A setting of training, and what a run that goes on may do with it."""
+    return field(default=default, metadata={"resume": resume})
 
 
 @dataclass(frozen=True)
 class Training:
     """Settings of a training run.
 
+    A run that goes on is held to the settings that decide what is learnt. ``seed`` stays as it was; ``goals``,
+    ``mixed_precision``, ``final_lr``, ``target_rate`` and the dataset change only if ``changed`` names them. The others
+    may change at any time.
+
     Args:
         updates: Updates of model, actor and critic in all.
         seed: Seeds weights and sampling.
         device: Where to train.
         threads: Threads of PyTorch on a CPU; 0 leaves PyTorch's own choice.
-        log_interval: Updates between two lines of the log, over which losses are averaged. Signals are answered and
-            checkpoints are written at these moments, so the other intervals are rounded up to multiples of it.
+        log_interval: Updates between two lines of the log, over which losses are averaged.
         checkpoint_interval: Updates between two checkpoints.
         eval_interval: Updates between two evaluations; 0 for none.
         eval_episodes: Episodes per evaluation, one to each of the task's first landmark goals.
@@ -34,30 +45,43 @@ class Training:
             millimetres of its goal only with a small one (docs/results/reacher).
         target_rate: Share of the critic that moves into the slow critic at each update.
         loggers: Where to log beside the CSV files.
+        changed: What is meant to differ from what the folder's checkpoint was trained with: names of settings above, and
+            ``"dataset"`` for one that has grown or is another.
     """
 
-    updates: int = 10_000
-    seed: int = 0
-    device: str = "cpu"
-    threads: int = 0
-    log_interval: int = 50
-    checkpoint_interval: int = 500
-    eval_interval: int = 500
-    eval_episodes: int = 10
-    eval_steps: int = 100
-    video_interval: int = 2000
-    goals: Literal["uniform", "stored"] = "uniform"
-    compile: bool | None = None
-    cudagraph: bool | None = None
-    mixed_precision: bool = False
-    final_lr: float = 0.1
-    target_rate: float = 0.02
-    loggers: tuple[Literal["tensorboard", "wandb"], ...] = field(default=())
+    updates: int = setting(10_000, resume="free")
+    seed: int = setting(0, resume="same")
+    device: str = setting("cpu", resume="free")
+    threads: int = setting(0, resume="free")
+    log_interval: int = setting(50, resume="free")
+    checkpoint_interval: int = setting(500, resume="free")
+    eval_interval: int = setting(500, resume="free")
+    eval_episodes: int = setting(10, resume="free")
+    eval_steps: int = setting(100, resume="free")
+    video_interval: int = setting(2000, resume="free")
+    goals: Literal["uniform", "stored"] = setting("uniform", resume="asked")
+    compile: bool | None = setting(None, resume="free")
+    cudagraph: bool | None = setting(None, resume="free")
+    mixed_precision: bool = setting(False, resume="asked")
+    final_lr: float = setting(0.1, resume="asked")
+    target_rate: float = setting(0.02, resume="asked")
+    loggers: tuple[Literal["tensorboard", "wandb"], ...] = setting((), resume="free")
+    changed: tuple[str, ...] = setting((), resume="free")
 
     def __post_init__(self) -> None:
         for name in ("updates", "log_interval", "checkpoint_interval", "eval_episodes", "eval_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.updates % self.log_interval:
-            raise ValueError(f"updates must be a multiple of log_interval, got {self.updates} and {self.log_interval}")
         check_choices(self)
+        for name in self.changed:
+            if name not in self.changeable():
+                raise ValueError(f"changed must name {', '.join(self.changeable())}, got {name!r}")
+
+    @classmethod
+    def changeable(cls) -> list[str]:
+        """What ``changed`` can name."""
+        return ["dataset", *(one.name for one in fields(cls) if one.metadata["resume"] == "asked")]
+
+    def deciding(self) -> dict[str, Any]:
+        """The settings that decide what is learnt."""
+        return {one.name: getattr(self, one.name) for one in fields(self) if one.metadata["resume"] != "free"}
