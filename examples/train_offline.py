@@ -5,6 +5,8 @@ Can be stopped (Ctrl-C, SIGTERM) and run again: it goes on where it was, to the 
 
 from __future__ import annotations
 
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -15,7 +17,7 @@ from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.evaluation import LandmarkEvaluation
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm
-from torchrl_ocwm.training.config import keep_config, recipe, to_dataclass
+from torchrl_ocwm.training.config import keep_config, recipe, run_folder, to_dataclass
 from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.settings import Training
 
@@ -27,22 +29,24 @@ def main(config: DictConfig) -> None:
     if dataset.metadata.get("environment") != config.env.name:
         raise DatasetError(f"{dataset.path}: holds {dataset.metadata.get('environment')}, not env={config.env.name}")
     config.env.options = dataset.metadata["options"]  # whatever the command line says: these are what is trained on
-    keep_config(config)
+    folder = run_folder(config)
     torch.manual_seed(training.seed)
     agent = build_agent(
         to_dataclass(AgentConfig, config.agent),
         Task.from_dict(dataset.metadata["task"]),
         to_dataclass(Size, config.size),
     )
-    evaluation = LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps)
-    checkpoint = train_offline(
-        agent,
-        dataset,
-        config.output,
-        training,
-        evaluate=evaluation if training.eval_interval else None,
-        film=OpenLoopFilm(agent, dataset, Path(config.output) / "videos"),
-    )
+    # Made only if they are used: each checks whether it can do its work before any is done.
+    evaluation = film = None
+    with ExitStack() as stack:
+        if training.eval_interval:
+            evaluation = stack.enter_context(
+                LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps)
+            )
+        if training.video_interval:
+            film = OpenLoopFilm(agent, dataset, folder / "videos")
+        keep = partial(keep_config, config, folder)
+        checkpoint = train_offline(agent, dataset, folder, training, evaluate=evaluation, film=film, on_start=keep)
     print(f"checkpoint: {checkpoint}")
     print(f"log, videos: {checkpoint.parent}")
 

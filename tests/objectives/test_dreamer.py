@@ -73,7 +73,11 @@ def test_without_a_goal_it_is_torchrls_loss(make_agent: Any, records: TensorDict
     agent = make_agent("dreamer", lambda_object_position=1.0)
     parts = agent.loss
     ours = GoalConditionedDreamerLoss(
-        parts.model_loss, parts.actor_loss, parts.value_loss, replay_value_loss_weight=replay_weight
+        parts.model_loss,
+        parts.actor_loss,
+        parts.value_loss,
+        replay_value_loss_weight=replay_weight,
+        replay_context=True,
     )
     torch.manual_seed(1)
     got = ours(records)

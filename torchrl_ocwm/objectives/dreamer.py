@@ -29,6 +29,8 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
             of the records, so that it needs an agent without a goal source.
         continuation_horizon: Discount horizon of that term, steps.
         lmbda: λ of that term.
+        replay_context: Also return the detached latents, nested under ``replay_context`` as ``DreamerV3Loss`` does;
+            loggers that take scalars only do not take them.
 
     Raises:
         ValueError: for a replay value loss together with a goal source.
@@ -53,6 +55,7 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
         replay_value_loss_weight: float = 0.0,
         continuation_horizon: float = 333.0,
         lmbda: float = 0.95,
+        replay_context: bool = False,
     ) -> None:
         if goal_source is not None and replay_value_loss_weight:
             raise ValueError(
@@ -70,6 +73,7 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
         actor_loss.set_keys(state="latent", belief="latent")
         # Not a submodule: the world model's parameters in it are the model loss's.
         self.__dict__["goal_source"] = goal_source
+        self.replay_context = replay_context
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -79,7 +83,7 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
         return list(dict.fromkeys(keys))
 
     def forward(self, sample: TensorDictBase) -> TensorDictBase:
-        """Losses and metrics of records ``[B, T]``, scalars, and the detached latents under ``replay_context``."""
+        """Losses and metrics of records ``[B, T]``, scalars."""
         model_losses, records = self.model_loss(sample)
         after = records.get("next")
         latent = TensorDict(
@@ -91,7 +95,7 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
         losses = model_losses.update(actor_losses).update(value_losses)
         if self.replay_value_loss_weight:
             losses["loss_replay_value"] = self.replay_value_loss_weight * self._replay_value(sample, latent, imagined)
-        return losses.set(self.tensor_keys.replay_context, latent.detach())
+        return losses.set(self.tensor_keys.replay_context, latent.detach()) if self.replay_context else losses
 
     def imagination_start(self, frames: TensorDictBase) -> TensorDictBase:
         """Start states ``[B * T]`` with goals, without gradients.

@@ -13,8 +13,11 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import CheckpointError
+
+from torchrl_ocwm.files import replacing
 
 T = TypeVar("T")
 _EXPECTED = (ValueError, ModuleNotFoundError, CheckpointError, FloatingPointError, RuntimeError)
@@ -86,11 +89,22 @@ def _compose(valid: DictConfig, name: str, override: str) -> None:
         sys.exit(f"ConfigError: unknown key {key!r}; valid here: {keys}")
 
 
-def keep_config(config: DictConfig) -> None:
-    """Put a configuration in place of what Hydra wrote before the script began, which may know less."""
+def keep_config(config: DictConfig, folder: Path) -> None:
+    """Keep a configuration in the folder of a run, where Hydra would."""
+    file = folder / ".hydra" / "config.yaml"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(file) as new:
+        OmegaConf.save(config, new)
+
+
+def run_folder(config: DictConfig) -> Path:
+    """The folder of a run: ``output``, and in a multirun below it what the command line sets and ``output`` lacks."""
     hydra_config = HydraConfig.get()
-    if hydra_config.output_subdir is not None:
-        OmegaConf.save(config, Path(hydra_config.runtime.output_dir) / hydra_config.output_subdir / "config.yaml")
+    if hydra_config.mode is not RunMode.MULTIRUN:
+        return Path(config.output)
+    given = {item.lstrip("+").partition("=")[0]: item.replace("/", "_") for item in hydra_config.overrides.task}
+    shown = {"output"} if "output" in given else {"agent", "env", "size", "training.seed"}
+    return Path(config.output, ",".join(item for key, item in given.items() if key not in shown))
 
 
 def to_dataclass(kind: type[T], config: DictConfig) -> T:

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -103,9 +104,7 @@ def train_offline(
 class _Run:
     """A run up to its first update, or to the one at which it goes on."""
 
-    def __init__(
-        self, agent: Agent, dataset: EpisodeDataset, file: Path, training: Training, bar: ProgressBar
-    ) -> None:
+    def __init__(self, agent: Agent, dataset: EpisodeDataset, file: Path, training: Training, bar: ProgressBar) -> None:
         self.agent, self.file, self.training, self.bar = agent, file, training, bar
         recover(file)
         if file.exists():
@@ -137,43 +136,40 @@ class _Run:
     def train(self, evaluate: Evaluate | None, film: Film | None) -> None:
         """Make the updates that are left."""
         trainer, training, folder = self.trainer, self.training, self.file.parent
-        loggers = make_loggers(folder, training.loggers, name=folder.name)
-        loggers.cut_back(self.updates)
-        trainer.logger = loggers
-        stop = StopOnSignals(trainer)
-
-        def save(updates: int) -> None:  # noqa: ARG001
-            trainer.save_trainer(force_save=True)
-
-        def evaluated(updates: int) -> dict[str, float] | None:
-            try:
-                return stop.look(evaluate, updates)
-            except Exception as error:
-                save(updates)
-                raise EvaluationError(
-                    f"the evaluation after {updates} updates failed ({type(error).__name__}: {error}); the checkpoint "
-                    "of this update is kept: run the same command again to go on, with eval_interval=0 if need be"
-                ) from error
-
-        def filmed(updates: int) -> None:
-            try:
-                file = stop.look(film, updates)
-                if file is not None:
-                    loggers.log_video("open_loop", file, updates)
-            except Exception as error:
-                warnings.warn(
-                    f"no video after {updates} updates ({type(error).__name__}: {error}); training goes on",
-                    RuntimeWarning,
-                    stacklevel=2,
-                )
-
-        Every(trainer, training.checkpoint_interval, save, at_end=True)
-        if evaluate is not None:
-            Every(trainer, training.eval_interval, evaluated)
-        if film is not None:
-            Every(trainer, training.video_interval, filmed)
-        with stop, self.bar.running(self.updates, training.updates):
+        trainer.logger = self.loggers = make_loggers(folder, training.loggers, name=folder.name)
+        self.loggers.cut_back(self.updates)
+        with StopOnSignals(trainer) as stop, self.bar.running(self.updates, training.updates):
+            Every(trainer, training.checkpoint_interval, self._save, at_end=True)
+            if evaluate is not None:
+                Every(trainer, training.eval_interval, partial(self._evaluate, partial(stop.look, evaluate)))
+            if film is not None:
+                Every(trainer, training.video_interval, partial(self._film, partial(stop.look, film)))
             trainer.train()
+
+    def _save(self, updates: int) -> None:  # noqa: ARG002
+        self.trainer.save_trainer(force_save=True)
+
+    def _evaluate(self, evaluate: Evaluate, updates: int) -> dict[str, float]:
+        try:
+            return evaluate(updates)
+        except Exception as error:
+            self._save(updates)
+            raise EvaluationError(
+                f"the evaluation after {updates} updates failed ({type(error).__name__}: {error}); the checkpoint of "
+                "this update is kept: run the same command again to go on, with eval_interval=0 if need be"
+            ) from error
+
+    def _film(self, film: Film, updates: int) -> None:
+        try:
+            file = film(updates)
+            if file is not None:  # a signal broke it off
+                self.loggers.log_video("open_loop", file, updates)
+        except Exception as error:
+            warnings.warn(
+                f"no video after {updates} updates ({type(error).__name__}: {error}); training goes on",
+                RuntimeWarning,
+                stacklevel=2,
+            )
 
 
 def _make_sampler(agent: Agent, dataset: EpisodeDataset, training: Training) -> Callable[..., TensorDictBase]:

@@ -34,7 +34,8 @@ class ClippedAdam(AdamW):
     def __init__(
         self, groups: list[dict[str, Any]], *, max_norm: float = 100.0, eps: float = 1e-5, decay: float = 1e-6
     ) -> None:
-        decaying = [{**group, "weight_decay": decay / group["lr"]} for group in groups]
+        # A learning rate of 0 keeps a part as it is, so that nothing of it decays.
+        decaying = [{**group, "weight_decay": decay / group["lr"] if group["lr"] else 0.0} for group in groups]
         super().__init__(decaying, eps=eps, fused=True)
         self.max_norm = max_norm
 

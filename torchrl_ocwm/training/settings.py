@@ -45,8 +45,8 @@ class Training:
             millimetres of its goal only with a small one (docs/results/reacher).
         target_rate: Share of the critic that moves into the slow critic at each update.
         loggers: Where to log beside the CSV files.
-        changed: What is meant to differ from what the folder's checkpoint was trained with: names of settings above, and
-            ``"dataset"`` for one that has grown or is another.
+        changed: What is meant to differ from what the folder's checkpoint was trained with: names of settings above,
+            and ``"dataset"`` for one that has grown or is another.
     """
 
     updates: int = setting(10_000, resume="free")
