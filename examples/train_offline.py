@@ -5,8 +5,9 @@ Can be stopped (Ctrl-C, SIGTERM) and run again: it goes on where it was, to the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from pathlib import Path
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 
@@ -16,7 +17,7 @@ from torchrl_ocwm.envs import Task
 from torchrl_ocwm.envs.registry import EnvChoice
 from torchrl_ocwm.evaluation import LandmarkEvaluation
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm
-from torchrl_ocwm.recipes import recipe
+from torchrl_ocwm.recipes import keep_settings, recipe, run_folder
 from torchrl_ocwm.settings import Settings
 from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.settings import Training
@@ -51,17 +52,22 @@ def main(config: TrainOffline) -> None:
     dataset = EpisodeDataset.open(config.dataset)
     if dataset.metadata.get("environment") != config.env.name:
         raise DatasetError(f"{dataset.path}: holds {dataset.metadata.get('environment')}, not env={config.env.name}")
+    # Whatever the command line says: the dataset's options are those that are trained on.
+    config = replace(config, env=EnvChoice(config.env.name, dataset.metadata["options"]))
+    folder = run_folder(config.output)
     torch.manual_seed(training.seed)
     agent = build_agent(config.agent, Task.from_dict(dataset.metadata["task"]), config.size)
-    evaluation = LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps)
-    checkpoint = train_offline(
-        agent,
-        dataset,
-        config.output,
-        training,
-        evaluate=evaluation if training.eval_interval else None,
-        film=OpenLoopFilm(agent, dataset, Path(config.output) / "videos"),
-    )
+    # Made only if they are used: each checks whether it can do its work before any is done.
+    evaluation = film = None
+    with ExitStack() as stack:
+        if training.eval_interval:
+            evaluation = stack.enter_context(
+                LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps)
+            )
+        if training.video_interval:
+            film = OpenLoopFilm(agent, dataset, folder / "videos")
+        keep = partial(keep_settings, config, folder)
+        checkpoint = train_offline(agent, dataset, folder, training, evaluate=evaluation, film=film, on_start=keep)
     print(f"checkpoint: {checkpoint}")
     print(f"log, videos: {checkpoint.parent}")
 

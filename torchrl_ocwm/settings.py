@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from functools import cache
 from inspect import cleandoc
@@ -21,7 +21,12 @@ class SettingsError(UserError, ValueError):
 
 
 def setting(
-    default: Any = MISSING, *, at_least: float | None = None, above: float | None = None, at_most: float | None = None
+    default: Any = MISSING,
+    *,
+    at_least: float | None = None,
+    above: float | None = None,
+    at_most: float | None = None,
+    **notes: Any,
 ) -> Any:
     """A field of a settings class, with the range of its values; of each of them, if it holds several.
 
@@ -30,9 +35,11 @@ def setting(
         at_least: Its smallest value.
         above: What it has to be larger than.
         at_most: Its largest value.
+        notes: What else is to be known of it, for whoever reads the field's metadata.
     """
     limits = {"at_least": at_least, "above": above, "at_most": at_most}
-    return field(default=default, metadata={name: limit for name, limit in limits.items() if limit is not None})
+    known = {name: limit for name, limit in limits.items() if limit is not None}
+    return field(default=default, metadata={**known, **notes})
 
 
 class Settings:
@@ -231,9 +238,7 @@ def field_docs(kind: Any) -> dict[str, str]:
     return docs
 
 
-@cache
-def _hints(kind: Any) -> dict[str, Any]:
-    return get_type_hints(kind)
+_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
 
 
 def _read_union(choices: tuple[Any, ...], value: Any, at: str) -> Any:

@@ -3,7 +3,7 @@
 from torchrl_ocwm.agents.agent import Agent, Policy
 from torchrl_ocwm.agents.behaviour import LearntBehaviour
 from torchrl_ocwm.agents.build import build_agent
-from torchrl_ocwm.agents.checkpoint import load_agent
+from torchrl_ocwm.agents.checkpoint import load_agent, save_agent
 from torchrl_ocwm.agents.config import AgentConfig, Behaviour, Learning, Size
 from torchrl_ocwm.agents.goal_sources import (
     EnvironmentGoals,
@@ -66,4 +66,5 @@ __all__ = [
     "build_agent",
     "load_agent",
     "register",
+    "save_agent",
 ]

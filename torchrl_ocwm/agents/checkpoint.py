@@ -2,40 +2,53 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.checkpoint import Checkpoint, CheckpointError
+from torchrl.checkpoint import CheckpointError
 
+from torchrl_ocwm import __version__
 from torchrl_ocwm.agents.agent import Agent, Policy
+from torchrl_ocwm.agents.archive import Archive, read_manifest
 from torchrl_ocwm.agents.config import AgentConfig, Size
 from torchrl_ocwm.agents.presets import flat
+from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs.task import Task
-from torchrl_ocwm.settings import from_dict, to_dict
+from torchrl_ocwm.settings import Settings, SettingsError, from_dict, to_dict
 
 
-def describe(agent: Agent) -> dict[str, Any]:
-    """What it takes to build an agent again; fits in JSON."""
-    return {"agent": to_dict(agent.config), "size": to_dict(agent.size), "task": to_dict(agent.task)}
+def save_agent(agent: Agent, path: str | Path) -> Path:
+    """Save an agent that was trained in a loop of your own; :func:`load_agent` reads it.
 
+    Args:
+        agent: The agent.
+        path: File to write, or to replace when the new one is whole.
 
-def rebuild(description: dict[str, Any]) -> Agent:
-    """An agent with fresh weights from what :func:`describe` gave; only registered parts are ever built.
+    Returns:
+        The file.
 
     Raises:
-        SettingsError: if a part or a setting is unknown here.
+        CheckpointError: if it cannot be written.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_ocwm.agents import build_agent
+        >>> from torchrl_ocwm.testing import reacher_task
+        >>> agent = build_agent("dreamer_pcp", reacher_task(), size="debug")
+        >>> policy = load_agent(save_agent(agent, tempfile.mkdtemp() + "/agent.zip"))
+        >>> policy.agent.config == agent.config
+        True
     """
-    config = from_dict(AgentConfig, description["agent"], "agent")
-    size = from_dict(Size, description["size"], "size")
-    return Agent(Task.from_dict(description["task"]), config, size)
+    return Archive(agent=describe(agent), loss_module=agent.loss).save(path)
 
 
 def load_agent(path: str | Path, *, device: torch.device | str = "cpu") -> Policy:
     """Load a trained agent's policy from a checkpoint; no dataset and no simulator is needed.
 
     Args:
-        path: A checkpoint that training wrote.
+        path: A checkpoint that training or :func:`save_agent` wrote.
         device: Where to put it.
 
     Returns:
@@ -43,32 +56,90 @@ def load_agent(path: str | Path, *, device: torch.device | str = "cpu") -> Polic
         ``agent`` attribute is the whole agent.
 
     Raises:
-        CheckpointError: if there is no checkpoint, or not one of an agent of this library.
+        CheckpointError: if there is no checkpoint, a damaged one, or not one of an agent of this library.
+        ValueError: if there is no such device.
     """
-    path = Path(path)
-    agent = rebuild(read_description(path))
-    Checkpoint(loss_module=agent.loss).load(path, map_location=device)
+    path, device = Path(path), usable_device(device)
+    description = read_description(path)
+    with torch.device("meta"):  # shapes without memory
+        needed = sum(value.numel() * value.itemsize for value in rebuild(description).loss.parameters())
+    if needed > path.stat().st_size:
+        raise CheckpointError(f"{path}: describes an agent of {needed} bytes, which cannot be in it; it is damaged")
+    agent = rebuild(description)
+    Archive(loss_module=agent.loss).load(path, map_location="cpu")
     agent.to(device).eval().requires_grad_(False)
     return agent.policy()
 
 
-def read_description(path: Path) -> dict[str, Any]:
-    """The description of the agent in a checkpoint.
+@dataclass(frozen=True)
+class Description(Settings):
+    """What it takes to build an agent again.
+
+    Args:
+        agent: World model and behaviours.
+        size: How large it is, and how it learns.
+        task: What it is for.
+        release: The release of this library that wrote it.
+    """
+
+    agent: AgentConfig
+    size: Size
+    task: Task
+    release: str
+
+
+def describe(agent: Agent) -> dict[str, Any]:
+    """What it takes to build an agent again; fits in JSON."""
+    return to_dict(Description(agent.config, agent.size, agent.task, __version__))
+
+
+def rebuild(description: Any) -> Agent:
+    """An agent with fresh weights from what :func:`describe` gave; only registered parts are ever built.
 
     Raises:
-        CheckpointError: if there is no checkpoint, or not one of an agent of this library.
+        CheckpointError: if the description lacks something, or holds what an agent cannot have.
     """
-    if not path.exists():
-        raise CheckpointError(f"{path}: no such checkpoint")
+    parts = read_parts(description)
     try:
-        components = Checkpoint.manifest(path)["components"]
-    except Exception as error:  # whatever a file that is no checkpoint makes a zip or JSON reader raise
-        raise CheckpointError(f"{path}: not a checkpoint of TorchRL ({error})") from error
+        return Agent(parts.task, parts.agent, parts.size)
+    except ValueError as error:
+        raise CheckpointError(f"the checkpoint describes an agent that cannot be built: {error}") from error
+
+
+def read_parts(description: Any) -> Description:
+    """What :func:`describe` gave, checked whole.
+
+    Raises:
+        CheckpointError: if the description lacks something, or holds what an agent cannot have.
+    """
+    release = description.get("release", "0.1") if isinstance(description, dict) else "0.1"
+    try:
+        return from_dict(Description, description)
+    except SettingsError as error:
+        if release == __version__:
+            raise CheckpointError(f"the checkpoint is damaged: {error}") from error
+        raise CheckpointError(
+            f"the checkpoint is of release {release!r}, this is {__version__}: train again, or use that one ({error})"
+        ) from error
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """The description of the agent in a checkpoint, after all of the file has been checked against its checksums.
+
+    Raises:
+        CheckpointError: if there is no checkpoint, a damaged one, or not one of an agent of this library.
+    """
+    components = read_manifest(path)["components"]
     if not {"agent", "loss_module"} <= set(components):
         raise CheckpointError(
             f"{path}: a TorchRL checkpoint, but not of an agent of torchrl_ocwm ({sorted(components)})"
         )
-    return Checkpoint(agent={}).load(path).values["agent"]
+    description = Archive(agent={}).load(path).values["agent"]
+    try:
+        read_parts(description)
+    except CheckpointError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    return description
 
 
 def check_same_agent(agent: Agent, path: Path) -> None:
@@ -77,11 +148,10 @@ def check_same_agent(agent: Agent, path: Path) -> None:
     Raises:
         CheckpointError: with what differs.
     """
-    there, here = flat(read_description(path)), flat(describe(agent))
+    there, here = (flat(to_dict(parts)) for parts in (read_parts(read_description(path)), read_parts(describe(agent))))
+    names = [name for name in dict.fromkeys([*here, *there]) if name != "release"]
     differences = [
-        f"{name}: {there.get(name)} there, {here.get(name)} here"
-        for name in dict.fromkeys([*here, *there])
-        if there.get(name) != here.get(name)
+        f"{name}: {there.get(name)} there, {here.get(name)} here" for name in names if there.get(name) != here.get(name)
     ]
     if differences:
         raise CheckpointError(f"{path}: a checkpoint of another agent ({'; '.join(differences)})")

@@ -17,6 +17,23 @@ from torchrl_ocwm.evaluation.open_loop import open_loop_latents
 from torchrl_ocwm.modules import ObjectWorldModel, WorldModel
 
 
+def check_ffmpeg() -> None:
+    """Raise where no video can be written.
+
+    Raises:
+        ModuleNotFoundError: with what to install.
+    """
+    try:
+        import imageio_ffmpeg
+
+        imageio_ffmpeg.get_ffmpeg_exe()
+    except (ModuleNotFoundError, RuntimeError) as error:
+        raise ModuleNotFoundError(
+            "videos need ffmpeg: pip install 'torchrl-ocwm[recipes]', or ask for none (training.video_interval=0)",
+            name="imageio_ffmpeg",
+        ) from error
+
+
 def write_video(path: str | Path, frames: Tensor, *, fps: int = 15, scale: int = 3) -> None:
     """Write an mp4 video.
 
@@ -105,6 +122,9 @@ class OpenLoopFilm:
         length: Frames of each, at most the shortest episode.
         context: Frames that the model sees.
 
+    Raises:
+        ModuleNotFoundError: if there is no ffmpeg to write them with.
+
     Called with the number of updates; returns the file that it wrote.
     """
 
@@ -118,6 +138,7 @@ class OpenLoopFilm:
         length: int = 50,
         context: int = 5,
     ) -> None:
+        check_ffmpeg()
         self.agent, self.folder, self.context = agent, Path(folder), context
         lengths = torch.tensor(dataset.episode_lengths)
         length = min(length, int(lengths.min()))

@@ -1,5 +1,5 @@
 """Recipes: settings from the command line, with Hydra. Needs the extra ``recipes``."""
 
-from torchrl_ocwm.recipes.config import recipe
+from torchrl_ocwm.recipes.config import keep_settings, recipe, run_folder
 
-__all__ = ["recipe"]
+__all__ = ["keep_settings", "recipe", "run_folder"]

@@ -6,10 +6,13 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
@@ -17,6 +20,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl_ocwm.agents import AGENTS, SIZES
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.errors import UserError
+from torchrl_ocwm.files import replacing
 from torchrl_ocwm.parts import load_plugins
 from torchrl_ocwm.settings import field_docs, from_dict, to_dict
 
@@ -69,6 +73,23 @@ def store_options() -> None:
             store.store(name, to_dict(row), group=group)
     for name, environment in ENVIRONMENTS.items():
         store.store(name, {"name": name, "options": to_dict(environment.options())}, group="env")
+
+
+def keep_settings(settings: Any, folder: Path) -> None:
+    """Keep the settings of a run in its folder, as ``config.yaml``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with replacing(folder / "config.yaml") as new:
+        OmegaConf.save(OmegaConf.create(to_dict(settings)), new)
+
+
+def run_folder(output: str) -> Path:
+    """The folder of a run: ``output``, and in a multirun below it what the command line sets and ``output`` lacks."""
+    hydra_config = HydraConfig.get()
+    if hydra_config.mode is not RunMode.MULTIRUN:
+        return Path(output)
+    given = {item.lstrip("+").partition("=")[0]: item.replace("/", "_") for item in hydra_config.overrides.task}
+    shown = {"output"} if "output" in given else {"agent", "env", "size", "training.seed"}
+    return Path(output, ",".join(item for key, item in given.items() if key not in shown))
 
 
 def help_lines(kind: type, at: str = "") -> Iterator[str]:

@@ -5,31 +5,25 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.trainers import Trainer
-from tqdm import tqdm
 
 
 class UpdateClock:
-    """Takes the place of a collector when nothing is collected: each tick stands for some updates.
+    """Takes the place of a collector when nothing is collected: each tick stands for one update.
 
     TorchRL's trainer counts collected frames; with this clock the frames that it counts, logs and saves by are updates.
-
-    Args:
-        updates_per_tick: Updates between two ticks.
     """
 
     init_random_frames = 0
 
-    def __init__(self, updates_per_tick: int) -> None:
-        self.updates_per_tick = updates_per_tick
-
     def __iter__(self) -> Iterator[TensorDictBase]:
         while True:
-            yield TensorDict({}, [self.updates_per_tick])
+            yield TensorDict({}, [1])
 
     def shutdown(self) -> None:
         """Nothing to stop."""
@@ -42,28 +36,63 @@ class UpdateClock:
         """Nothing to restore."""
 
 
-class ProgressBar:
-    """Updates done, updates per second and the main losses.
+class LossLog:
+    """Logs losses averaged over some updates, and ends a run whose losses are not finite.
 
     Args:
         trainer: The trainer to follow.
-        shown: Names of the losses to show.
-        disable: Show nothing.
+        interval: Updates between two lines of the log; the last update gets a line too.
+        show: Called with the number of updates and the averages.
     """
 
-    def __init__(self, trainer: Trainer, shown: tuple[str, ...], *, disable: bool = False) -> None:
-        self.trainer, self.shown, self.disable = trainer, shown, disable
-        self.bar: tqdm | None = None
-        trainer.register_op("post_optim_complete_log", self._show)
+    def __init__(self, trainer: Trainer, interval: int, show: Callable[[int, TensorDictBase], None]) -> None:
+        self.trainer, self.interval, self.show = trainer, interval, show
+        self._total: TensorDictBase | None = None
+        self._count = 0
+        trainer.register_op("post_optim_complete_log", self._add)
 
-    def _show(self, updates: int, losses: TensorDictBase) -> None:
-        if self.bar is None:
-            first = updates - self.trainer.optim_steps_per_batch
-            total = self.trainer.total_frames
-            self.bar = tqdm(total=total, initial=first, unit="update", desc="train", disable=self.disable)
-        values = {name.removeprefix("loss_"): f"{float(losses[name]):.3g}" for name in self.shown if name in losses}
-        self.bar.set_postfix(values, refresh=False)
-        self.bar.update(updates - self.bar.n)
+    def _add(self, updates: int, losses: TensorDictBase) -> dict[str, Any] | None:
+        self._total = losses if self._total is None else self._total + losses
+        self._count += 1
+        if updates % self.interval and updates != self.trainer.total_frames:
+            return None
+        self.check(updates)
+        mean = self._total / self._count
+        self._total, self._count = None, 0
+        self.show(updates, mean)
+        return dict(mean.items())
+
+    def check(self, updates: int) -> None:
+        """Look at the losses since the last line of the log.
+
+        Raises:
+            FloatingPointError: with the losses that are not finite.
+        """
+        losses = {} if self._total is None else dict(self._total.items())
+        bad = [name for name, value in losses.items() if name.startswith("loss_") and not value.isfinite().all()]
+        if bad:
+            raise FloatingPointError(
+                f"after {updates} updates {', '.join(sorted(bad))} is not finite; check the data and the learning "
+                "rates. The last checkpoint is still good."
+            )
+
+
+class RunTrainer(Trainer):
+    """TorchRL's trainer, which saves an update once, and none whose losses are not finite.
+
+    Attributes:
+        losses: What it asks before it saves.
+    """
+
+    losses: LossLog
+    _saved = -1
+
+    def save_trainer(self, force_save: bool = False) -> None:
+        """Save if told to; the trainer's own calls leave it to :class:`Every`."""
+        if force_save and self._saved != self.collected_frames:
+            self.losses.check(self.collected_frames)
+            super().save_trainer(force_save=True)
+            self._saved = self.collected_frames
 
 
 class Every:
@@ -73,52 +102,114 @@ class Every:
         trainer: The trainer to follow.
         interval: Updates between two calls, 0 for none.
         function: Called with the number of updates; returns scalars to log, or nothing.
+        at_end: Also call it at the last update.
     """
 
-    def __init__(self, trainer: Trainer, interval: int, function: Callable[[int], dict[str, float] | None]) -> None:
-        self.trainer, self.interval, self.function = trainer, interval, function
+    def __init__(
+        self,
+        trainer: Trainer,
+        interval: int,
+        function: Callable[[int], dict[str, float] | None],
+        *,
+        at_end: bool = False,
+    ) -> None:
+        self.trainer, self.interval, self.function, self.at_end = trainer, interval, function, at_end
         if interval:
             trainer.register_op("post_steps_log", self._call)
 
-    def _call(self, batch: TensorDictBase) -> dict[str, float] | None:
-        done, tick = self.trainer.collected_frames, batch.numel()
-        due = done // self.interval > (done - tick) // self.interval
-        if not due:
+    def _call(self, batch: TensorDictBase) -> dict[str, float] | None:  # noqa: ARG002
+        done = self.trainer.collected_frames
+        ends = self.at_end and done >= self.trainer.total_frames
+        return None if done % self.interval and not ends else self.function(done)
+
+
+class _Stopped(BaseException):
+    """Leave what is only looked at."""
+
+
+class StopOnSignals:
+    """SIGTERM and the first Ctrl-C end training after the current update, with a checkpoint; the second works as usual.
+
+    Args:
+        trainer: The trainer to stop.
+
+    Use it in a ``with`` block.
+    """
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.trainer = trainer
+        self._before: dict[int, Any] = {}
+        self._stopped = self._looking = False
+
+    def __enter__(self) -> StopOnSignals:
+        try:
+            for number in (signal.SIGTERM, signal.SIGINT):
+                self._before[number] = signal.signal(number, self._stop)
+        except ValueError:  # not in the main thread: signals are not ours to take
+            pass
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _stop(self, number: int, frame: Any) -> None:  # noqa: ARG002
+        signal.signal(number, self._before[number])
+        self._stopped = True
+        self.trainer.request_stop(signal.Signals(number).name)
+        if self._looking:
+            raise _Stopped
+
+    def look(self, function: Callable[[int], Any], updates: int) -> Any:
+        """Call what only looks at the agent: it changes no random number, and a signal breaks it off."""
+        try:
+            self._looking = True
+            result = None
+            if not self._stopped:
+                with torch.random.fork_rng():
+                    result = function(updates)
+            self._looking = False
+            return result
+        except _Stopped:
             return None
-        with torch.random.fork_rng():  # what is looked at does not change what is learnt
-            return self.function(done)
+        finally:
+            self._looking = False
 
 
-def stop_when_not_finite(updates: int, losses: TensorDictBase) -> None:
-    """Hook that ends a run whose losses are not finite.
+class ProgressBar:
+    """Updates done, updates per second and some losses.
+
+    Args:
+        shown: Names of the losses to show.
+        disable: Show nothing.
 
     Raises:
-        FloatingPointError: with the losses that are not.
+        ModuleNotFoundError: if tqdm is missing, with the extra to install.
     """
-    bad = [name for name, value in losses.items() if name.startswith("loss_") and not value.isfinite().all()]
-    if bad:
-        raise FloatingPointError(
-            f"after {updates} updates {', '.join(sorted(bad))} is not finite; check the data and the learning rates. "
-            "The last checkpoint is still good."
-        )
 
+    def __init__(self, shown: tuple[str, ...], *, disable: bool = False) -> None:
+        self.shown, self.disable = shown, disable
+        self.bar: Any = None
+        if not disable and find_spec("tqdm") is None:
+            raise ModuleNotFoundError(
+                "a progress bar needs tqdm: pip install 'torchrl-ocwm[recipes]', or train with progress=False",
+                name="tqdm",
+            )
 
-@contextmanager
-def stop_on_signals(trainer: Trainer) -> Iterator[None]:
-    """SIGTERM and the first Ctrl-C end training after the current tick, with a checkpoint."""
-    handlers: dict[int, Any] = {}
+    @contextmanager
+    def running(self, done: int, updates: int) -> Iterator[None]:
+        """Show it, from an update to the last."""
+        if self.disable:
+            yield
+            return
+        from tqdm import tqdm
 
-    def stop(number: int, frame: Any) -> None:  # noqa: ARG001
-        trainer.request_stop(signal.Signals(number).name)
-        signal.signal(number, handlers[number])  # the second time as usual
+        with tqdm(total=updates, initial=done, unit="update", desc="train") as self.bar:
+            yield
 
-    try:
-        for number in (signal.SIGTERM, signal.SIGINT):
-            handlers[number] = signal.signal(number, stop)
-    except ValueError:  # not in the main thread: signals are not ours to take
-        pass
-    try:
-        yield
-    finally:
-        for taken, handler in handlers.items():
-            signal.signal(taken, handler)
+    def show(self, updates: int, losses: TensorDictBase) -> None:
+        """Show how far it is."""
+        if self.bar is not None:
+            values = {name.removeprefix("loss_"): f"{float(losses[name]):.3g}" for name in self.shown if name in losses}
+            self.bar.set_postfix(values, refresh=False)
+            self.bar.update(updates - self.bar.n)

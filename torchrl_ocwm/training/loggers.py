@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 from torchrl.record.loggers import CSVLogger, Logger
+
+from torchrl_ocwm.files import replacing
+
+
+class LogError(RuntimeError):
+    """The log cannot be written; the message says where and why."""
 
 
 class Loggers:
@@ -28,9 +35,36 @@ class Loggers:
         """Nothing to restore."""
 
     def log_scalar(self, name: str, value: Tensor | float, step: int | None = None) -> None:
-        """Log one value."""
+        """Log one value.
+
+        Raises:
+            LogError: if it cannot be written.
+        """
         for logger in self.loggers:
-            logger.log_scalar(name, float(value), step=step)
+            try:
+                logger.log_scalar(name, float(value), step=step)
+            except OSError as error:
+                _drop_files(logger)
+                raise LogError(
+                    f"{logger.log_dir}: cannot write the log ({error.strerror or error}); the last checkpoint is kept: "
+                    "mend that, and run the same command again"
+                ) from error
+
+    def cut_back(self, step: int) -> None:
+        """Forget what was logged after a step, for a run that goes on from there.
+
+        Rows of CSV files are removed, also one that was cut off. TensorBoard is told to hide what comes after the step.
+        Weights & Biases shows what goes on as a run of its own.
+        """
+        for logger in self.loggers:
+            if isinstance(logger, CSVLogger):
+                for file in Path(logger.log_dir, logger.exp_name, "scalars").rglob("*.csv"):
+                    _cut(file, step)
+            elif type(logger).__name__ == "TensorboardLogger":
+                from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
+                restart = Event(step=step + 1, session_log=SessionLog(status=SessionLog.START))
+                logger.experiment.file_writer.add_event(restart)
 
     def log_video(self, name: str, file: Path, step: int | None = None) -> None:
         """Show a video file in Weights & Biases; the other loggers do not take files."""
@@ -70,3 +104,24 @@ def make_loggers(folder: Path, also: tuple[str, ...] = (), *, name: str = "run")
 
             loggers.append(WandbLogger(name, save_dir=str(folder), project="torchrl_ocwm"))
     return Loggers(loggers)
+
+
+def _cut(file: Path, step: int) -> None:
+    rows = file.read_text().splitlines(keepends=True)
+    kept = [row for row in rows if row.endswith("\n") and _step(row) <= step]
+    if kept != rows:
+        with replacing(file) as new:
+            new.write_text("".join(kept))
+
+
+def _step(row: str) -> float:
+    first = row.partition(",")[0]
+    return int(first) if first.isdecimal() else float("inf")
+
+
+def _drop_files(logger: Logger) -> None:
+    """Close a CSV logger's files, whose last rows cannot be written."""
+    files = getattr(logger.experiment, "files", {})
+    while files:
+        with suppress(OSError):
+            files.popitem()[1].close()

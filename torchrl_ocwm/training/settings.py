@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, fields
+from typing import Any, Literal
 
 from torchrl_ocwm.settings import Settings, SettingsError, setting
+
+#: What a run that goes on may do with a setting: keep it as it was, change it when told so, change it freely.
+Resume = Literal["same", "asked", "free"]
 
 
 @dataclass(frozen=True)
 class Training(Settings):
     """Settings of a training run.
 
+    A run that goes on is held to the settings that decide what is learnt. ``seed`` stays as it was; ``goals``,
+    ``mixed_precision``, ``final_lr``, ``target_rate`` and the dataset change only if ``changed`` names them. The others
+    may change at any time.
+
     Args:
         updates: Updates of model, actor and critic in all.
         seed: Seeds weights and sampling.
         device: Where to train.
         threads: Threads of PyTorch on a CPU; 0 leaves PyTorch's own choice.
-        log_interval: Updates between two lines of the log, over which losses are averaged. Signals are answered and
-            checkpoints are written at these moments, so the other intervals are rounded up to multiples of it.
+        log_interval: Updates between two lines of the log, over which losses are averaged.
         checkpoint_interval: Updates between two checkpoints.
         eval_interval: Updates between two evaluations; 0 for none.
         eval_episodes: Episodes per evaluation, one to each of the task's first landmark goals.
@@ -34,10 +40,12 @@ class Training(Settings):
             millimetres of its goal only with a small one (docs/results/reacher).
         target_rate: Share of the critic that moves into the slow critic at each update.
         loggers: Where to log beside the CSV files.
+        changed: What is meant to differ from what the folder's checkpoint was trained with: names of settings above,
+            and ``"dataset"`` for one that has grown or is another.
     """
 
     updates: int = setting(10_000, at_least=1, at_most=10**9)
-    seed: int = setting(0, at_least=0, at_most=2**32 - 1)
+    seed: int = setting(0, at_least=0, at_most=2**32 - 1, resume="same")
     device: str = "cpu"
     threads: int = setting(0, at_least=0, at_most=1024)
     log_interval: int = setting(50, at_least=1)
@@ -46,17 +54,30 @@ class Training(Settings):
     eval_episodes: int = setting(10, at_least=1)
     eval_steps: int = setting(100, at_least=1)
     video_interval: int = setting(2000, at_least=0)
-    goals: Literal["uniform", "stored"] = "uniform"
+    goals: Literal["uniform", "stored"] = setting("uniform", resume="asked")
     compile: bool | None = None
     cudagraph: bool | None = None
-    mixed_precision: bool = False
-    final_lr: float = setting(0.1, at_least=0, at_most=1)
-    target_rate: float = setting(0.02, above=0, at_most=1)
+    mixed_precision: bool = setting(False, resume="asked")
+    final_lr: float = setting(0.1, at_least=0, at_most=1, resume="asked")
+    target_rate: float = setting(0.02, above=0, at_most=1, resume="asked")
     loggers: tuple[Literal["tensorboard", "wandb"], ...] = ()
+    changed: tuple[str, ...] = ()
 
     def check(self) -> None:
-        """Whole ticks of the log."""
-        if self.updates % self.log_interval:
-            raise SettingsError(
-                f"updates must be a multiple of log_interval, got {self.updates} and {self.log_interval}"
-            )
+        """Only what may change can be said to."""
+        for name in self.changed:
+            if name not in self.changeable():
+                raise SettingsError(f"changed must name {', '.join(self.changeable())}, got {name!r}")
+
+    @classmethod
+    def changeable(cls) -> list[str]:
+        """What ``changed`` can name."""
+        return ["dataset", *(one.name for one in fields(cls) if _resume(one) == "asked")]
+
+    def deciding(self) -> dict[str, Any]:
+        """The settings that decide what is learnt."""
+        return {one.name: getattr(self, one.name) for one in fields(self) if _resume(one) != "free"}
+
+
+def _resume(one: Any) -> Resume:
+    return one.metadata.get("resume", "free")

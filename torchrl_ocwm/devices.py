@@ -1,0 +1,27 @@
+"""Devices by name."""
+
+from __future__ import annotations
+
+import torch
+
+
+def usable_device(name: torch.device | str) -> torch.device:
+    """A device, after it has been tried.
+
+    Raises:
+        ValueError: if there is no such device here.
+
+    Examples:
+        >>> usable_device("cpu")
+        device(type='cpu')
+        >>> usable_device("gpu")
+        Traceback (most recent call last):
+        ValueError: device 'gpu' cannot be used (Expected one of cpu, cuda, ...); device 'cpu' always can
+    """
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (AssertionError, RuntimeError, TypeError) as error:
+        reason = str(error).partition("\n")[0].rstrip(".")
+        raise ValueError(f"device {str(name)!r} cannot be used ({reason}); device 'cpu' always can") from error
+    return device
