@@ -73,17 +73,18 @@ def flat_loss(model: WorldModel, config: AgentConfig, size: Size) -> WorldModelL
 
 def object_loss(model: WorldModel, config: AgentConfig, size: Size) -> FOCUSModelLoss:
     """What trains a world model with object latents."""
+    positional: dict[str, Any] = {
+        "lambda_positional": config.lambda_positional,
+        "positional_distance": config.latent_distance,
+        "positional_gradient": config.positional_gradient,
+    }
     return FOCUSModelLoss(
-        model.records(),
-        lambda_positional=config.lambda_positional,
-        positional_distance=config.latent_distance,
-        positional_gradient=config.positional_gradient,
-        **_weights(config, size),
+        model.records(), **(positional if config.goal == "object_latent" else {}), **_weights(config, size)
     )
 
 
-def _weights(config: AgentConfig, size: Size) -> dict[str, float]:
-    names = ("lambda_proprio", "lambda_object_position", "lambda_goal_position")
+def _weights(config: AgentConfig, size: Size) -> dict[str, Any]:
+    names = [f"lambda_{name}" for name in config.observed]  # the weight of anything else would do nothing
     return {"lambda_dynamic": size.lambda_dynamic, **{name: getattr(config, name) for name in names}}
 
 

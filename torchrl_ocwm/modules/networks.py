@@ -21,6 +21,8 @@ from torchrl.modules import (
     RSSMPriorV3,
 )
 
+from torchrl_ocwm.modules.dtypes import unit_image
+
 Style = Literal["dreamer_v3", "dreamer_v2"]
 UNIMIX = 0.01
 
@@ -54,7 +56,7 @@ def make_mlp(
 
 
 def make_image_encoder(style: Style, image_size: int, *, depth: int, mults: tuple[int, ...]) -> tuple[nn.Module, int]:
-    """A CNN for images ``[..., 3, H, W]`` uint8, and the number of features that it gives.
+    """A CNN for images ``[..., 3, H, W]`` uint8 or float32 in [0, 1], and the number of features that it gives.
 
     Raises:
         ValueError: if the image does not go through the CNN.
@@ -118,10 +120,10 @@ def _check_image_size(style: Style, image_size: int, mults: tuple[int, ...]) -> 
 
 
 class _ScaledImage(nn.Module):
-    """uint8 to [−0.5, 0.5]."""
+    """To [−0.5, 0.5]."""
 
     def forward(self, pixels: Tensor) -> Tensor:
-        return pixels.float() / 255 - 0.5
+        return unit_image(pixels) - 0.5
 
 
 class _ShiftedImage(nn.Module):

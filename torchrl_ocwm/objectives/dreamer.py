@@ -68,15 +68,28 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
             lmbda=lmbda,
         )
         actor_loss.set_keys(state="latent", belief="latent")
+        # TorchRL's losses do not say what they read and write, and cannot be printed without.
+        actor_loss.in_keys, actor_loss.out_keys = ["latent"], ["loss_actor"]
+        value_loss.in_keys, value_loss.out_keys = ["latent", "lambda_target"], ["loss_value"]
         # Not a submodule: the world model's parameters in it are the model loss's.
         self.__dict__["goal_source"] = goal_source
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What the world model reads, and the targets of its predictions."""
-        model, done = self.model_loss, unravel_key(("next", self.value_loss.tensor_keys.done))
-        keys = [*model.world_model.in_keys, self.tensor_keys.is_init, *model.targets, done]
+        """What the world model reads, the targets of its predictions, and what the goal source reads beside them."""
+        model = self.model_loss
+        source = [] if self.goal_source is None else self.goal_source.in_keys
+        frames = [key for key in source if unravel_key(key)[0] != "latent"]
+        after = [unravel_key(("next", key)) for key in (*frames, self.value_loss.tensor_keys.done)]
+        written = model.world_model.out_keys
+        keys = [*model.in_keys, self.tensor_keys.is_init, *(key for key in after if key not in written)]
         return list(dict.fromkeys(keys))
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The losses, which are to be summed. There are metrics too, and ``replay_context``."""
+        replay = ["loss_replay_value"] if self.replay_value_loss_weight else []
+        return [*self.model_loss.out_keys, *self.actor_loss.out_keys, *self.value_loss.out_keys, *replay]
 
     def forward(self, sample: TensorDictBase) -> TensorDictBase:
         """Losses and metrics of records ``[B, T]``, scalars, and the detached latents under ``replay_context``."""
