@@ -37,6 +37,7 @@ from torchrl_ocwm.modules import (
     WorkspaceUnits,
     WorldModel,
 )
+from torchrl_ocwm.modules.acting import refuse_export_without_latent
 from torchrl_ocwm.modules.goals import GOAL
 from torchrl_ocwm.modules.networks import make_mlp
 from torchrl_ocwm.objectives import FOCUSModelLoss, GoalConditionedDreamerLoss, WorldModelLoss
@@ -231,6 +232,7 @@ class Policy(TensorDictSequential):
 
     def __init__(self, agent: Agent, *modules: TensorDictModuleBase) -> None:
         super().__init__(*modules)
+        self.register_forward_pre_hook(refuse_export_without_latent, with_kwargs=True)
         self.__dict__["agent"] = agent  # not a submodule: the modules hold the parameters
 
     @property
