@@ -130,7 +130,5 @@ def test_an_exported_policy_acts_as_the_policy(make_agent: Any, name: str) -> No
 def test_a_policy_is_not_exported_without_its_memory(make_agent: Any) -> None:
     agent = make_agent()
     policy, example = agent.policy().eval(), inputs(agent, random_records(reacher_task(), 1, 1), 0, {})
-    with pytest.raises(
-        ValueError, match="without its latent: latent_state, latent_belief, latent_action are"
-    ):
+    with pytest.raises(ValueError, match="without its latent: latent_state, latent_belief, latent_action are"):
         torch.export.export(policy, args=(), kwargs=example, strict=False)
