@@ -79,7 +79,7 @@ class GoalConditionedDreamerLoss(DreamerV3Loss):
         """What the world model reads, the targets of its predictions, and what the goal source reads beside them."""
         model = self.model_loss
         source = [] if self.goal_source is None else self.goal_source.in_keys
-        frames = [key for key in source if unravel_key(key)[0] != "latent"]
+        frames = [key for key in source if (key if isinstance(key, str) else key[0]) != "latent"]
         after = [unravel_key(("next", key)) for key in (*frames, self.value_loss.tensor_keys.done)]
         written = model.world_model.out_keys
         keys = [*model.in_keys, self.tensor_keys.is_init, *(key for key in after if key not in written)]
