@@ -107,6 +107,13 @@ def test_positional_loss_trains_the_chosen_side(gradient: Any, sides: str) -> No
     assert (extracted.grad is not None) == ("e" in sides)
 
 
+@pytest.mark.parametrize("setting", ["distance", "gradient"])
+def test_positional_loss_refuses_what_it_does_not_know(setting: str) -> None:
+    latent, visible = torch.randn(4, 1, 3), torch.ones(4, 1, dtype=torch.bool)
+    with pytest.raises(ValueError, match=f"{setting} must be one of .*, got 'other'"):
+        positional_latent_loss(latent, latent, visible, **{setting: "other"})  # type: ignore[arg-type]
+
+
 def moved(module: nn.Module) -> bool:
     return any(float(p.grad.abs().sum()) > 0 for p in module.parameters() if p.grad is not None)
 

@@ -21,6 +21,7 @@ from torchrl.modules import (
     RSSMPriorV3,
 )
 
+from torchrl_ocwm.modules.choices import check_choice
 from torchrl_ocwm.modules.dtypes import unit_image
 
 Style = Literal["dreamer_v3", "dreamer_v2"]
@@ -44,6 +45,7 @@ def make_mlp(
         >>> make_mlp("dreamer_v2", 5, 3, layers=1, units=8, outscale=0.0)(torch.ones(2, 4), torch.ones(2, 1))[0]
         tensor([0., 0., 0.], grad_fn=<SelectBackward0>)
     """
+    check_choice("style", style, Style)
     if style == "dreamer_v3":
         return DreamerV3MLP(in_features, out_features, depth=layers, num_cells=units, outscale=outscale)
     if out_features is None:
@@ -82,6 +84,7 @@ def make_rssm(
     style: Style, *, action: int, embedding: int, categoricals: int, classes: int, belief: int, hidden: int, blocks: int
 ) -> tuple[RSSMPriorV3, RSSMPosteriorV3]:
     """Prior and posterior of a discrete RSSM."""
+    check_choice("style", style, Style)
     v3 = style == "dreamer_v3"
     prior = RSSMPriorV3(
         action_shape=(action,),
@@ -107,6 +110,7 @@ def make_rssm(
 
 
 def _check_image_size(style: Style, image_size: int, mults: tuple[int, ...]) -> None:
+    check_choice("style", style, Style)
     if style == "dreamer_v2" and image_size != 64:
         raise ValueError(
             f"the CNN of style 'dreamer_v2' takes images of 64 x 64 pixels, got {image_size} x {image_size}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
+from torchrl_ocwm.modules.choices import check_choice
 from torchrl_ocwm.modules.dtypes import flags, unit_image
 from torchrl_ocwm.objectives.world_model import Term, WorldModelLoss, visible_position_reconstruction
 
@@ -91,11 +92,16 @@ def positional_latent_loss(
         distance: Minus the cosine similarity, or the mean squared error.
         gradient: What is trained: the positional encoder, the latents, or both.
 
+    Raises:
+        ValueError: for another distance or gradient.
+
     Examples:
         >>> latent = torch.tensor([[[3.0, 4.0]]])
         >>> positional_latent_loss(latent, 2 * latent, torch.tensor([[True]]))
         tensor(-1.)
     """
+    check_choice("distance", distance, LatentDistance)
+    check_choice("gradient", gradient, PositionalGradient)
     if gradient == "encoder":
         extracted = extracted.detach()
     elif gradient == "latent":
@@ -186,8 +192,13 @@ class FOCUSModelLoss(WorldModelLoss):
             positional=lambda_positional,
             image_latent=lambda_image_latent,
         )
-        self._set_choice("positional_distance", positional_distance, LatentDistance, "cosine")
-        self._set_choice("positional_gradient", positional_gradient, PositionalGradient, "both")
+        for name, value in (("positional_distance", positional_distance), ("positional_gradient", positional_gradient)):
+            if value is not None:
+                self._given[name] = "positional"
+        self.positional_distance: LatentDistance = positional_distance or "cosine"
+        self.positional_gradient: PositionalGradient = positional_gradient or "both"
+        check_choice("positional_distance", self.positional_distance, LatentDistance)
+        check_choice("positional_gradient", self.positional_gradient, PositionalGradient)
 
     def terms(self) -> dict[str, Term]:
         """Masks and masked colours in place of the image, and what the two kinds of goals are encoded with."""
@@ -219,10 +230,3 @@ class FOCUSModelLoss(WorldModelLoss):
     def _image_latent(self, alone: Tensor, latent: Tensor, visible: Tensor) -> Tensor:
         objects, distance = latent[..., :-1, :], self.positional_distance
         return positional_latent_loss(alone[..., :-1, :], objects, visible, distance=distance, gradient="encoder")
-
-    def _set_choice(self, name: str, value: str | None, choices: Any, default: str) -> None:
-        if value is not None:
-            if value not in get_args(choices):
-                raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(choices)))}, got {value!r}")
-            self._given[name] = "positional"
-        setattr(self, name, default if value is None else value)
