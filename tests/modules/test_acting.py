@@ -90,3 +90,45 @@ def test_needs_to_know_where_episodes_start(make_agent: Any) -> None:
     step = observation(random_records(reacher_task(), 2, 1), 0).exclude("is_init")
     with pytest.raises(KeyError, match="InitTracker"):
         make_agent().policy()(step)
+
+
+STEPS = 20
+
+
+def inputs(agent: Agent, records: TensorDict, time: int, latent: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """What an exported policy is called with at a step: observations by name, and the latent of the step before."""
+    seen = observation(records, time)
+    return {**{key: seen[key] for key in agent.policy().in_keys if isinstance(key, str)}, **latent}
+
+
+def zeros(agent: Agent, number: int) -> dict[str, torch.Tensor]:
+    sizes = {"state": agent.model.state, "belief": agent.model.belief, "action": agent.model.action}
+    return {f"latent_{name}": torch.zeros(number, size) for name, size in sizes.items()}
+
+
+@pytest.mark.parametrize("name", ["dreamer", "focus_lcp"])
+def test_an_exported_policy_acts_as_the_policy(make_agent: Any, name: str) -> None:
+    """The latent goes in and comes out: without a memory it would act otherwise from the second step on."""
+    agent = make_agent(name)
+    policy, records = agent.policy().eval(), random_records(reacher_task(), 3, STEPS)
+    names = ["_".join([key] if isinstance(key, str) else key) for key in policy.out_keys]
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        example = inputs(agent, records, 0, zeros(agent, 3))
+        exported = torch.export.export(policy, args=(), kwargs=example, strict=False).module()
+        carried, latent, beliefs = TensorDict({}, [3]), zeros(agent, 3), []
+        for time in range(STEPS):
+            torch.manual_seed(time)
+            carried = policy(observation(records, time).update(carried.select("latent", strict=False)))
+            torch.manual_seed(time)
+            out = dict(zip(names, exported(**inputs(agent, records, time, latent)), strict=True))
+            torch.testing.assert_close(out["action"], carried["action"], rtol=1e-4, atol=1e-5)
+            latent = {key: out[key] for key in latent}
+            beliefs.append(out["latent_belief"])
+    assert (beliefs[0] - beliefs[-1]).abs().max() > 1e-3
+
+
+def test_a_policy_is_not_exported_without_its_memory(make_agent: Any) -> None:
+    agent = make_agent()
+    policy, example = agent.policy().eval(), inputs(agent, random_records(reacher_task(), 1, 1), 0, {})
+    with pytest.raises(ValueError, match="without its latent: latent_state, latent_belief, latent_action are"):
+        torch.export.export(policy, args=(), kwargs=example, strict=False)

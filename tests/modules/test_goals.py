@@ -30,10 +30,47 @@ def observation(number: int) -> TensorDict:
 
 def test_frame_goals_are_a_permutation_of_the_frames() -> None:
     frames = TensorDict({"frame": torch.arange(60.0).reshape(3, 10, 2)}, [3, 10])
+    frames["object_visible"] = torch.ones(3, 10, 1, dtype=torch.bool)
     source = FrameGoals(TensorDictModule(nn.Identity(), ["frame"], [("latent", "goal")]))
     goals = source(frames.clone())["latent", "goal"]
     assert sorted(goals.flatten(0, 1).tolist()) == frames["frame"].flatten(0, 1).tolist()
     assert not torch.equal(goals, frames["frame"])
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_hidden_frames_are_no_goals(index: int) -> None:
+    """Those that are seen are used equally often, in random order."""
+    frames = TensorDict({"frame": torch.arange(12.0).reshape(2, 6, 1)}, [2, 6])
+    frames["object_visible"] = torch.zeros(2, 6, 2, dtype=torch.bool)
+    frames["object_visible"][..., index] = frames["frame"].squeeze(-1) % 3 == 0
+    source = FrameGoals(TensorDictModule(nn.Identity(), ["frame"], [("latent", "goal")]), object_index=index)
+    goals = [source(frames.clone())["latent", "goal"].flatten() for _ in range(2)]
+    for drawn in goals:
+        assert drawn.unique(return_counts=True)[0].tolist() == [0, 3, 6, 9]
+        assert drawn.unique(return_counts=True)[1].tolist() == [3, 3, 3, 3]
+    assert not torch.equal(*goals)
+
+
+@pytest.mark.parametrize("key", [None, "object_visible"])
+def test_all_frames_are_goals_if_none_or_nobody_says_more(key: Any) -> None:
+    frames = TensorDict({"frame": torch.arange(12.0).reshape(2, 6, 1)}, [2, 6])
+    frames["object_visible"] = torch.zeros(2, 6, 1, dtype=torch.bool)
+    source = FrameGoals(TensorDictModule(nn.Identity(), ["frame"], [("latent", "goal")]), object_visible=key)
+    assert sorted(source(frames)["latent", "goal"].flatten().tolist()) == list(range(12))
+
+
+@pytest.mark.parametrize("source", ["frames", "mixed"])
+@pytest.mark.parametrize("name", ["dreamer_pcp", "focus_lcp"])
+def test_an_agent_has_no_goals_that_nobody_saw(make_agent: Any, records: TensorDict, name: str, source: str) -> None:
+    records["next", "object_visible"][:, 3:] = False
+    agent = make_agent(name, {"behaviours.reach.goals": source})
+    after = agent.loss.model_loss(records.select(*agent.loss.in_keys))[1]["next"]
+    goals = agent.loss.imagination_start(after)["latent", "goal"]
+    known = UnitRMS()(after["image_latent"][:, :, 0]) if name == "focus_lcp" else after["object_units"]
+    among = (goals.unsqueeze(1) == known[:, 3:].flatten(0, 1)).all(-1).any(1)
+    seen = (goals.unsqueeze(1) == known[:, :3].flatten(0, 1)).all(-1).any(1)
+    assert not among.any()
+    assert seen.any()
 
 
 def test_mixed_goals_choose_for_each_element() -> None:

@@ -4,10 +4,12 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_ocwm.agents import SIZES, Agent, build_agent
+from torchrl_ocwm.modules import ImaginationEnv
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import STYLES, reacher_task
 
@@ -34,6 +36,51 @@ def test_rollout_is_torchrls(make_agent: Any, name: str) -> None:
     for key in ours.keys(True, True):
         torch.testing.assert_close(ours[key], theirs[key], msg=str(key))
     assert ours.batch_size == theirs.batch_size == (4, 3)
+
+
+FIXED = {"auto_reset": False, "break_when_any_done": False}
+
+
+def times(keys: list[Any], out: str) -> TensorDictModule:
+    """What is read first, times the mean of what is read second."""
+    return TensorDictModule(lambda value, factor: value * factor.mean(-1, keepdim=True), keys, [out])
+
+
+@pytest.mark.parametrize(
+    ("in_reward", "in_policy"),
+    [("action", None), ("weight", None), ("loc", None), (None, "weight"), (("latent", "weight"), ("latent", "weight"))],
+)
+def test_what_reward_and_policy_read_is_there(agent: Agent, in_reward: Any, in_policy: Any) -> None:
+    """Beside the latent, and in it: the action, what the policy writes, and what was there at the start."""
+    parts, model = agent.imagination.world_model, agent.model
+    reward, policy = parts.get_reward_operator(), agent.actor
+    if in_reward is not None:
+        reward = TensorDictSequential(reward, times(["reward", in_reward], "reward"))
+    if in_policy is not None:
+        policy = TensorDictSequential(policy, times(["action", in_policy], "action"))
+    sizes = {"state": model.state, "belief": model.belief, "action": 2, "goal": 2}
+    env = ImaginationEnv(parts.get_transition_model_operator(), reward, **sizes)
+    start = env.reset().expand(4).clone()
+    start["weight"] = start["latent", "weight"] = torch.full((4, 1), 3.0)
+    torch.manual_seed(1)
+    ours = env.rollout(3, policy, tensordict=start.clone(), **FIXED)
+    torch.manual_seed(1)
+    theirs = EnvBase.rollout(env, 3, policy, tensordict=start.clone(), **FIXED)
+    torch.testing.assert_close(ours["action"], theirs["action"])
+    torch.testing.assert_close(ours["next", "reward"], theirs["next", "reward"])
+
+
+def test_a_policy_that_does_not_say_what_it_reads(agent: Agent) -> None:
+    """TorchRL's own rollout decides what it gets."""
+    start = agent.imagination.reset().expand(4).clone()
+    rollout = agent.imagination.rollout(3, lambda latent: latent["state"][..., :2], tensordict=start, **FIXED)
+    torch.testing.assert_close(rollout["action"], rollout["latent", "state"][..., :2])
+
+
+def test_the_short_cut_is_taken(agent: Agent, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(EnvBase, "rollout", None)
+    start = agent.imagination.reset().expand(4).clone()
+    assert agent.imagination.rollout(3, agent.actor, tensordict=start, **FIXED).shape == (4, 3)
 
 
 def test_an_ordinary_rollout_works_too(agent: Agent) -> None:

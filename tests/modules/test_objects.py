@@ -100,6 +100,10 @@ class TestLatentSimilarityReward:
         reward = LatentSimilarityReward(object_index=index, distance="chord")(self.data.clone())["reward"]
         torch.testing.assert_close(reward, torch.tensor([[expected]]))
 
+    def test_unknown_distance(self) -> None:
+        with pytest.raises(ValueError, match="distance must be one of 'cosine', 'mse', 'chord', got 'euclid'"):
+            LatentSimilarityReward(distance="euclid")  # type: ignore[arg-type]
+
     def test_chord_keeps_its_slope_where_the_cosine_is_flat(self) -> None:
         slopes = {}
         for distance in ("cosine", "chord"):

@@ -11,7 +11,7 @@ from torch import nn
 from torchrl_ocwm.agents import SIZES, build_agent
 from torchrl_ocwm.modules import UnitRMS
 from torchrl_ocwm.objectives import FOCUSModelLoss, mask_nll, object_reconstruction, positional_latent_loss
-from torchrl_ocwm.objectives.focus import visible_position_reconstruction
+from torchrl_ocwm.objectives.world_model import visible_position_reconstruction
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import STYLES, reacher_task
 
@@ -105,6 +105,13 @@ def test_positional_loss_trains_the_chosen_side(gradient: Any, sides: str) -> No
     positional_latent_loss(predicted, extracted, torch.ones(4, 1, dtype=torch.bool), gradient=gradient).backward()
     assert (predicted.grad is not None) == ("p" in sides)
     assert (extracted.grad is not None) == ("e" in sides)
+
+
+@pytest.mark.parametrize("setting", ["distance", "gradient"])
+def test_positional_loss_refuses_what_it_does_not_know(setting: str) -> None:
+    latent, visible = torch.randn(4, 1, 3), torch.ones(4, 1, dtype=torch.bool)
+    with pytest.raises(ValueError, match=f"{setting} must be one of .*, got 'other'"):
+        positional_latent_loss(latent, latent, visible, **{setting: "other"})  # type: ignore[arg-type]
 
 
 def moved(module: nn.Module) -> bool:
@@ -212,6 +219,29 @@ def test_weights_and_keys(make_agent: Any, records: TensorDict) -> None:
     got = losses(nested, batch)
     for name, value in plain.items():
         torch.testing.assert_close(got[name], value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"lambda_pixels": 0.0}, "lambda_pixels does nothing: FOCUSModelLoss has the terms .*object_pixels"),
+        ({"lambda_positional": 1.0}, "lambda_positional does nothing.*'positional_latent'"),
+        ({"lambda_image_latent": 1.0}, "lambda_image_latent does nothing.*'image_latent'"),
+        ({"positional_distance": "cosine"}, "positional_distance does nothing"),
+        ({"positional_gradient": "both"}, "positional_gradient does nothing"),
+        ({"positional_distance": "cos"}, "positional_distance must be one of 'cosine', 'mse', got 'cos'"),
+        ({"positional_gradient": "all"}, "positional_gradient must be one of 'encoder', 'latent', 'both', got 'all'"),
+    ],
+)
+def test_settings_that_would_do_nothing(make_agent: Any, records: TensorDict, settings: Any, message: str) -> None:
+    world_model = make_agent("focus_pcp").model.records()
+    with pytest.raises(ValueError, match=message):
+        FOCUSModelLoss(world_model, **settings)(records)
+
+
+def test_keys_of_the_whole_image_are_not_used(make_agent: Any) -> None:
+    with pytest.raises(ValueError, match="FOCUSModelLoss does not use the key 'reco_pixels'"):
+        make_agent("focus_pcp").loss.model_loss.set_keys(reco_pixels="reco_pixels")
 
 
 @pytest.mark.parametrize("name", ["focus", "focus_pcp", "focus_lcp"])

@@ -7,10 +7,13 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.objectives import DreamerV3ModelLoss
+from torchrl.objectives import DreamerV3ModelLoss, symlog
 
+from torchrl_ocwm.agents import AGENTS, SIZES, build_agent
 from torchrl_ocwm.objectives import WorldModelLoss
 from torchrl_ocwm.objectives.world_model import image_reconstruction, symlog_reconstruction
+from torchrl_ocwm.settings import change
+from torchrl_ocwm.testing import STYLES, reacher_task
 
 VECTORS = ("proprio", "object_units", "goal_units")
 
@@ -145,3 +148,120 @@ def test_reconstructions_by_hand() -> None:
     torch.testing.assert_close(image_reconstruction(torch.tensor([[[[0.5, 0.25]]]]), target), torch.tensor(0.3125))
     prediction, target = torch.tensor([[1.0, 0.0]]), torch.tensor([[-1.0, 0.0]])
     torch.testing.assert_close(symlog_reconstruction(prediction, target), torch.tensor(2.0).log().mul(2).square())
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_in_keys_are_what_is_read(make_agent: Any, records: TensorDict, name: str) -> None:
+    """All of them are needed, and no other."""
+    loss = make_agent(name).loss.model_loss
+    records["next", "reward"] += 3.0  # not what the fresh reward head predicts
+    torch.manual_seed(1)
+    expected, _ = loss(records)
+    torch.manual_seed(1)
+    got, _ = loss(records.select(*loss.in_keys))
+    for key, value in expected.items():
+        torch.testing.assert_close(got[key], value)
+    assert list(expected.keys()) == loss.out_keys
+    for key in loss.in_keys:
+        with pytest.raises(KeyError) as error:
+            loss(records.exclude(key))
+        assert error.value.args[0].startswith(f"the batch lacks [{key!r}], which the world model reads")
+
+
+def test_the_recorded_reward_is_the_target(make_agent: Any, records: TensorDict) -> None:
+    """Not the predicted one, which the world model writes in its place."""
+    loss = make_agent("dreamer").loss.model_loss
+    values = []
+    for reward in (0.0, 5.0):
+        torch.manual_seed(1)
+        values.append(loss(records.clone().set(("next", "reward"), torch.full((2, 6, 1), reward)))[0])
+    assert (values[0]["loss_model_reward"] - values[1]["loss_model_reward"]).abs() > 1e-3
+
+
+@pytest.mark.parametrize("name", ["dreamer_pcp", "focus_pcp"])
+def test_positions_of_hidden_objects_are_no_targets(make_agent: Any, records: TensorDict, name: str) -> None:
+    """They are old: the object is where it was last seen."""
+    loss = make_agent(name).loss.model_loss
+    records["next", "object_visible"][0, 2] = False
+    torch.manual_seed(1)
+    losses, after = loss(records)
+    after = after["next"]
+    error = symlog(after["reco_object_units"]) - symlog(after["object_units"])
+    error[0, 2] = 0
+    torch.testing.assert_close(losses["loss_model_object_position"], 200 * error.square().sum() / 12)
+
+
+@pytest.mark.parametrize("true", [1, 255])
+@pytest.mark.parametrize("name", ["dreamer", "focus_lcp"])
+def test_flags_as_integers(make_agent: Any, records: TensorDict, name: str, true: int) -> None:
+    records["next", "object_visible"][0, :3] = False
+    loss, as_integers = make_agent(name).loss.model_loss, records.clone()
+    for key in ("masks", "object_visible", "terminated"):
+        as_integers["next", key] = as_integers["next", key].to(torch.uint8) * true
+    torch.manual_seed(1)
+    expected, _ = loss(records)
+    torch.manual_seed(1)
+    got, _ = loss(as_integers)
+    for key, value in expected.items():
+        torch.testing.assert_close(got[key], value)
+
+
+@pytest.mark.parametrize("key", ["masks", "object_visible", "terminated"])
+def test_flags_as_floating_point_are_refused(make_agent: Any, records: TensorDict, key: str) -> None:
+    records["next", key] = records["next", key].float()
+    with pytest.raises(TypeError, match=rf"{key} must be bool, or integers .* got torch.float32, use {key} > 0.5"):
+        make_agent("focus_pcp").loss.model_loss(records)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
+@pytest.mark.parametrize("name", ["dreamer_pcp", "focus_lcp"])
+def test_images_in_floating_point(records: TensorDict, name: str, style: Any, dtype: torch.dtype) -> None:
+    """0.5 in floating point is what 127.5 would be in uint8, for every network and loss that sees an image."""
+    loss = build_agent(name, reacher_task(), change(SIZES["debug"], STYLES[style])).loss.model_loss
+    torch.manual_seed(1)
+    expected, _ = loss(records)
+    records["next", "pixels"] = records["next", "pixels"].to(dtype) / 255
+    torch.manual_seed(1)
+    got, _ = loss(records)
+    for key, value in expected.items():
+        torch.testing.assert_close(got[key], value, rtol=1e-4, atol=1e-5)
+
+
+def test_a_weight_without_its_term_is_refused(make_agent: Any, records: TensorDict) -> None:
+    world_model = make_agent("dreamer_pcp").model.records()
+    with pytest.raises(ValueError, match=r"lambda_goal_position does nothing.*not write.*reco_goal_units"):
+        WorldModelLoss(world_model, lambda_goal_position=9.0)(records)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        (
+            {"reco_proprio": "reco_propio"},
+            r"reco_proprio='reco_propio'.*does not write.*'reco_propio'.*reco_pixels",
+        ),
+        ({"posterior_logits": "logits"}, "does not write.*'logits'"),
+        ({"reco_goal_position": ("a", "b")}, "does not write.*'next', 'a', 'b'"),
+        ({"true_reward": "reward"}, "WorldModelLoss does not use the key 'true_reward'"),
+    ],
+)
+def test_keys_that_would_do_nothing(make_agent: Any, keys: Any, message: str) -> None:
+    loss = WorldModelLoss(make_agent("dreamer_pcp").model.records())
+    with pytest.raises(ValueError, match=message):
+        loss.set_keys(**keys)
+
+
+def test_a_mistyped_target_is_named(make_agent: Any, records: TensorDict) -> None:
+    loss = WorldModelLoss(make_agent("dreamer_pcp").model.records())
+    loss.set_keys(proprio="propio")
+    with pytest.raises(KeyError, match=r"lacks.*propio.*, which the world model reads or learns to predict"):
+        loss(records)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_everything_can_be_printed(make_agent: Any, name: str) -> None:
+    agent = make_agent(name)
+    for part in (*agent.modules(), agent.policy()):
+        assert type(part).__name__ in repr(part)
+    assert f"out_keys={agent.loss.out_keys}" in repr(agent)

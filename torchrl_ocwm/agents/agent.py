@@ -19,6 +19,7 @@ from torchrl_ocwm.agents.config import AgentConfig, Behaviour, Size
 from torchrl_ocwm.agents.scene import Scene
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.modules import ActingLatent, GivenGoals, ImaginationEnv
+from torchrl_ocwm.modules.acting import refuse_export_without_latent
 from torchrl_ocwm.objectives import GoalConditionedDreamerLoss
 from torchrl_ocwm.settings import SettingsError
 
@@ -39,6 +40,7 @@ class Policy(TensorDictSequential):
 
     def __init__(self, agent: Agent, behaviour: LearntBehaviour, *modules: TensorDictModuleBase) -> None:
         super().__init__(*modules)
+        self.register_forward_pre_hook(refuse_export_without_latent, with_kwargs=True)
         # Not submodules: the modules hold the parameters.
         self.__dict__["agent"], self.__dict__["behaviour"] = agent, behaviour
 

@@ -76,7 +76,7 @@ class _Observing(WorldModelPart):
         }
 
     def _weights(self, lambda_dynamic: float) -> dict[str, Any]:
-        names = ("lambda_proprio", "lambda_object_position", "lambda_goal_position")
+        names = [f"lambda_{name}" for name in self.observed]  # the weight of anything else would do nothing
         return {"lambda_dynamic": lambda_dynamic, **{name: getattr(self, name) for name in names}}
 
 

@@ -9,6 +9,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from torchrl_ocwm.modules.dtypes import flags
 from torchrl_ocwm.modules.units import WorkspaceUnits
 
 GOAL: NestedKey = ("latent", "goal")
@@ -59,30 +60,53 @@ class UniformGoals(TensorDictModuleBase):
 
 
 class FrameGoals(TensorDictModuleBase):
-    """Take the goal of each element of the batch from another element's frame.
+    """Take the goal of each element of the batch from the frame of a random element.
+
+    Frames in which the object is hidden are no goals: where it is, nobody has seen. The others are used equally often.
+    If it is hidden in all of them, all count, with the place where it was last seen.
 
     Args:
         goals: Writes the goal that a frame is, ``[*batch, G]``, from what is known of the frame.
-        goal_key: The key that it writes.
+        object_index: Which object has to be seen.
+        object_visible: Key that says which objects are, ``[*batch, O]`` bool; ``None``: every frame is a goal.
+        goal_key: The key that ``goals`` writes.
 
     Examples:
         >>> from tensordict import TensorDict
         >>> from tensordict.nn import TensorDictModule
         >>> frames = TensorDict({"frame": torch.arange(5.0).unsqueeze(-1)}, [5])
+        >>> frames["object_visible"] = torch.tensor([[True], [False], [True], [False], [False]])
         >>> goals = FrameGoals(TensorDictModule(nn.Identity(), ["frame"], [GOAL]))(frames)["latent", "goal"]
-        >>> goals.squeeze(-1).sort().values
-        tensor([0., 1., 2., 3., 4.])
+        >>> goals.squeeze(-1).unique()
+        tensor([0., 2.])
     """
 
-    def __init__(self, goals: TensorDictModuleBase, *, goal_key: NestedKey = GOAL) -> None:
+    def __init__(
+        self,
+        goals: TensorDictModuleBase,
+        *,
+        object_index: int = 0,
+        object_visible: NestedKey | None = "object_visible",
+        goal_key: NestedKey = GOAL,
+    ) -> None:
         super().__init__()
         self.goals, self.goal_key = goals, goal_key
-        self.in_keys, self.out_keys = list(goals.in_keys), [goal_key]
+        self.object_index, self.object_visible = object_index, object_visible
+        visible = [] if object_visible is None else [object_visible]
+        self.in_keys, self.out_keys = list(dict.fromkeys([*goals.in_keys, *visible])), [goal_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         goals = self.goals(tensordict).get(self.goal_key)
-        order = torch.rand(goals.shape[:-1], device=goals.device).flatten().argsort()
-        return tensordict.set(self.goal_key, goals.flatten(0, -2)[order].reshape(goals.shape))
+        order = torch.rand(goals.shape[:-1], device=goals.device).flatten()
+        if self.object_visible is None:
+            index = order.argsort()
+        else:
+            visible = flags(tensordict[self.object_visible], "object_visible")[..., self.object_index].flatten()
+            seen = torch.where(visible.any(), visible.sum(), visible.numel())
+            # Those that are seen come first, in random order, and then again until there is one for each element.
+            places = torch.arange(visible.numel(), device=goals.device) % seen
+            index = (order + ~visible).argsort()[places]
+        return tensordict.set(self.goal_key, goals.flatten(0, -2)[index].reshape(goals.shape))
 
 
 class MixedGoals(TensorDictModuleBase):
@@ -131,7 +155,7 @@ class GivenGoals(TensorDictModuleBase):
 
     Args:
         units: Workspace units of positions.
-        position: Encodes positions ``[..., D]`` in workspace units, to ``[..., G]``.
+        position: Encodes positions ``[..., D]`` in workspace units, to ``[..., G]``; ``None``: they are not understood.
         image: Encodes images ``[..., F, 3, H, W]`` uint8, to ``[..., G]``; ``None``: images are not understood.
         goal_key: Key written, ``[*batch, G]``.
 
@@ -139,7 +163,7 @@ class GivenGoals(TensorDictModuleBase):
     ``("goal", "pixels")`` ``[*batch, 3, H, W]`` or ``[*batch, F, 3, H, W]`` uint8.
 
     Raises:
-        ValueError: when called, for an image that is not understood, or a goal that is neither.
+        ValueError: when called, for a position or an image that is not understood, or a goal that is neither.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -157,7 +181,7 @@ class GivenGoals(TensorDictModuleBase):
     def __init__(
         self,
         units: WorkspaceUnits,
-        position: nn.Module,
+        position: nn.Module | None,
         image: nn.Module | None = None,
         *,
         goal_key: NestedKey = GOAL,
@@ -174,13 +198,18 @@ class GivenGoals(TensorDictModuleBase):
         if position is None and pixels is None:
             raise ValueError("a goal is given as 'position' or as 'pixels' under 'goal', which has neither")
         if pixels is None:
-            goal = self.position(self.units(position))
+            goal = self._of_positions(position)
         else:
             goal = self._of_images(pixels, len(tensordict.batch_size))
             if position is not None:
                 at = position.isfinite().all(-1, keepdim=True)
-                goal = torch.where(at, self.position(self.units(position.nan_to_num())), goal)
+                goal = torch.where(at, self._of_positions(position.nan_to_num()), goal)
         return tensordict.set(self.out_keys[0], goal)
+
+    def _of_positions(self, position: Tensor) -> Tensor:
+        if self.position is None:
+            raise ValueError("this agent takes goals as images, under ('goal', 'pixels')")
+        return self.position(self.units(position))
 
     def _of_images(self, pixels: Tensor, batch_dims: int) -> Tensor:
         if self.image is None:

@@ -70,13 +70,27 @@ class ImaginationEnv(DreamerEnv):
         """Imagine ``max_steps`` steps; takes the arguments of :meth:`torchrl.envs.EnvBase.rollout`.
 
         A rollout of fixed length from given states, as the losses ask for, runs without the checks that an environment
-        needs: on a CPU these take as long as the networks.
+        needs: on a CPU these take as long as the networks. It takes that short cut if policy and reward read nothing
+        but ``latent``.
         """
-        plain = policy is not None and set(kwargs) == {"auto_reset", "tensordict", "break_when_any_done"}
-        if args or not plain or kwargs["auto_reset"] or kwargs["break_when_any_done"]:
+        fixed = not args and set(kwargs) == {"auto_reset", "tensordict", "break_when_any_done"}
+        if not fixed or kwargs["auto_reset"] or kwargs["break_when_any_done"] or not self._reads_latents_only(policy):
             return super().rollout(max_steps, policy, *args, **kwargs)
         assert policy is not None
-        step = kwargs["tensordict"].select("latent")
+        return self._imagine(max_steps, policy, kwargs["tensordict"].select("latent"))
+
+    def _reads_latents_only(self, policy: Any) -> bool:
+        """Whether ``latent`` is all that has to be carried from step to step."""
+        if not isinstance(policy, TensorDictModuleBase):
+            return False
+        transition = self.world_model.get_transition_model_operator()
+        reward = self.world_model.get_reward_operator()
+        keys = [*policy.in_keys, *reward.in_keys, *(key for key in transition.in_keys if key != "action")]
+        return all((key if isinstance(key, str) else key[0]) == "latent" for key in keys)
+
+    def _imagine(
+        self, max_steps: int, policy: Callable[[TensorDictBase], TensorDictBase], step: TensorDictBase
+    ) -> TensorDictBase:
         transition = self.world_model.get_transition_model_operator()
         reward = self.world_model.get_reward_operator()
         latents, actions = [step["latent"]], []

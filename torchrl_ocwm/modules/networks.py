@@ -21,6 +21,9 @@ from torchrl.modules import (
     RSSMPriorV3,
 )
 
+from torchrl_ocwm.modules.choices import check_choice
+from torchrl_ocwm.modules.dtypes import unit_image
+
 Style = Literal["dreamer_v3", "dreamer_v2"]
 UNIMIX = 0.01
 
@@ -42,6 +45,7 @@ def make_mlp(
         >>> make_mlp("dreamer_v2", 5, 3, layers=1, units=8, outscale=0.0)(torch.ones(2, 4), torch.ones(2, 1))[0]
         tensor([0., 0., 0.], grad_fn=<SelectBackward0>)
     """
+    check_choice("style", style, Style)
     if style == "dreamer_v3":
         return DreamerV3MLP(in_features, out_features, depth=layers, num_cells=units, outscale=outscale)
     if out_features is None:
@@ -54,7 +58,7 @@ def make_mlp(
 
 
 def make_image_encoder(style: Style, image_size: int, *, depth: int, mults: tuple[int, ...]) -> tuple[nn.Module, int]:
-    """A CNN for images ``[..., 3, H, W]`` uint8, and the number of features that it gives.
+    """A CNN for images ``[..., 3, H, W]`` uint8 or float32 in [0, 1], and the number of features that it gives.
 
     Raises:
         ValueError: if the image does not go through the CNN.
@@ -80,6 +84,7 @@ def make_rssm(
     style: Style, *, action: int, embedding: int, categoricals: int, classes: int, belief: int, hidden: int, blocks: int
 ) -> tuple[RSSMPriorV3, RSSMPosteriorV3]:
     """Prior and posterior of a discrete RSSM."""
+    check_choice("style", style, Style)
     v3 = style == "dreamer_v3"
     prior = RSSMPriorV3(
         action_shape=(action,),
@@ -105,6 +110,7 @@ def make_rssm(
 
 
 def _check_image_size(style: Style, image_size: int, mults: tuple[int, ...]) -> None:
+    check_choice("style", style, Style)
     if style == "dreamer_v2" and image_size != 64:
         raise ValueError(
             f"the CNN of style 'dreamer_v2' takes images of 64 x 64 pixels, got {image_size} x {image_size}"
@@ -118,10 +124,10 @@ def _check_image_size(style: Style, image_size: int, mults: tuple[int, ...]) -> 
 
 
 class _ScaledImage(nn.Module):
-    """uint8 to [−0.5, 0.5]."""
+    """To [−0.5, 0.5]."""
 
     def forward(self, pixels: Tensor) -> Tensor:
-        return pixels.float() / 255 - 0.5
+        return unit_image(pixels) - 0.5
 
 
 class _ShiftedImage(nn.Module):

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 from torchrl.objectives import symlog
 
+from torchrl_ocwm.modules.dtypes import unit_image
 from torchrl_ocwm.modules.networks import Style, make_image_encoder, make_mlp
 
 
@@ -22,8 +23,8 @@ class ObservationEncoder(nn.Module):
         mlp_units: Units of each.
         style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
 
-    Called with ``pixels`` ``[..., 3, H, W]`` uint8 and vectors ``[..., any]`` float32; returns
-    ``[..., features]`` float32. Without vectors their part of the embedding is zero (:meth:`image_alone`).
+    Called with ``pixels`` ``[..., 3, H, W]``, uint8 or floating point in [0, 1], and vectors ``[..., any]`` float32;
+    returns ``[..., features]`` float32. Without vectors their part of the embedding is zero (:meth:`image_alone`).
 
     Raises:
         ValueError: if the image cannot be halved by every stage; when called, for inputs of other shapes.
@@ -57,7 +58,7 @@ class ObservationEncoder(nn.Module):
     def forward(self, pixels: Tensor, *vectors: Tensor) -> Tensor:
         """The embedding of an image and vectors."""
         self._check(pixels, vectors)
-        image = self.cnn(pixels)
+        image = self.cnn(unit_image(pixels))
         if self.mlp is None:
             return image
         if not vectors:

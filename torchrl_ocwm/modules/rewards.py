@@ -9,6 +9,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import cosine_similarity, normalize
 
+from torchrl_ocwm.modules.choices import check_choice
 from torchrl_ocwm.modules.units import WorkspaceUnits
 
 
@@ -62,10 +63,14 @@ class LatentSimilarity(nn.Module):
             √(2 − 2 cos), which keeps its slope up to the goal as a distance of positions does.
 
     Called with object latents ``[..., O + 1, L]`` and goals ``[..., L]``; returns ``[..., 1]``.
+
+    Raises:
+        ValueError: for another distance.
     """
 
     def __init__(self, object_index: int = 0, distance: LatentReward = "cosine") -> None:
         super().__init__()
+        check_choice("distance", distance, LatentReward)
         self.object_index, self.distance = object_index, distance
 
     def forward(self, object_latent: Tensor, goal: Tensor) -> Tensor:

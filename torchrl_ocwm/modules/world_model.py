@@ -124,6 +124,7 @@ class WorldModel(nn.Module, ABC):
                 out_keys=[("next", "posterior_logits"), ("next", "state")],
             ),
         )
+        rollout.in_keys = [*rollout.in_keys, "is_init"]  # TorchRL's takes it as optional: then memory crosses episodes
         return TensorDictSequential(
             InitialLatent(self.state, self.belief), *self._encode("next"), rollout, *self.decoders("next")
         )

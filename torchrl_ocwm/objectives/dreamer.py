@@ -85,6 +85,9 @@ class BehaviourLoss(LossModule):
         self.replay_value_loss_weight, self.prefix = replay_value_loss_weight, prefix
         self.continuation_horizon, self.lmbda = continuation_horizon, lmbda
         actor_loss.set_keys(state="latent", belief="latent")
+        # TorchRL's losses do not say what they read and write, and cannot be printed without.
+        actor_loss.in_keys, actor_loss.out_keys = ["latent"], ["loss_actor"]
+        value_loss.in_keys, value_loss.out_keys = ["latent", "lambda_target"], ["loss_value"]
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         pass
@@ -100,6 +103,13 @@ class BehaviourLoss(LossModule):
             value = self.value_loss.tensor_keys
             keys += [unravel_key(("next", key)) for key in (value.reward, value.done, value.terminated)]
         return list(dict.fromkeys(keys))
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The losses, which are to be summed; there are metrics too."""
+        replay = ["loss_replay_value"] if self.replay_value_loss_weight else []
+        reward = [] if self.reward_loss is None else self.reward_loss.out_keys
+        return [self._name(key) for key in ("loss_actor", "loss_value", *replay, *reward)]
 
     def forward(self, records: TensorDictBase) -> TensorDictBase:
         """Losses and metrics, scalars, of records ``[B, T]`` with what the world model made of them under ``next``."""
@@ -188,7 +198,6 @@ class GoalConditionedDreamerLoss(LossModule):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     model_loss: DreamerV3ModelLoss
-    behaviours: nn.ModuleDict
 
     def __init__(
         self,
@@ -204,12 +213,15 @@ class GoalConditionedDreamerLoss(LossModule):
         )
         self.return_context = return_context
 
+    def _each(self) -> list[BehaviourLoss]:
+        return [behaviour for behaviour in self.behaviours.children() if isinstance(behaviour, BehaviourLoss)]
+
     def set_keys(self, **kwargs: NestedKey) -> None:
         """Set keys, those of the latents in the behaviours too."""
         super().set_keys(**kwargs)
         latents = {name: key for name, key in kwargs.items() if name in ("state", "belief")}
         if latents:
-            for behaviour in self.behaviours.values():
+            for behaviour in self._each():
                 behaviour.set_keys(**latents)
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
@@ -219,9 +231,14 @@ class GoalConditionedDreamerLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """What the world model reads, the targets of its predictions, and what behaviours read of the records."""
         written = set(self.model_loss.world_model.out_keys)
-        behaviours = [key for one in self.behaviours.values() for key in one.in_keys if key not in written]
-        keys = [*self.model_loss.world_model.in_keys, self.tensor_keys.is_init, *self.model_loss.targets, *behaviours]
+        behaviours = [key for one in self._each() for key in one.in_keys if key not in written]
+        keys = [*self.model_loss.in_keys, self.tensor_keys.is_init, *behaviours]
         return list(dict.fromkeys(keys))
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The losses, which are to be summed; there are metrics too."""
+        return [*self.model_loss.out_keys, *(key for one in self._each() for key in one.out_keys)]
 
     def forward(self, sample: TensorDictBase) -> TensorDictBase:
         """Losses and metrics of records ``[B, T]``, scalars."""
@@ -229,7 +246,7 @@ class GoalConditionedDreamerLoss(LossModule):
         reward = unravel_key(("next", self.model_loss.tensor_keys.reward))
         if (recorded := sample.get(reward, None)) is not None:
             records.set(reward, recorded)  # a world model writes its prediction in the same place
-        for behaviour in self.behaviours.values():
+        for behaviour in self._each():
             more = behaviour(records)
             if twice := set(losses.keys()) & set(more.keys()):
                 raise ValueError(f"two losses have the name {sorted(twice)[0]!r}; give the behaviours a prefix each")

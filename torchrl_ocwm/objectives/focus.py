@@ -6,21 +6,24 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
-from torchrl.objectives import symlog
 
-from torchrl_ocwm.objectives.world_model import WorldModelLoss
+from torchrl_ocwm.modules.choices import check_choice
+from torchrl_ocwm.modules.dtypes import flags, unit_image
+from torchrl_ocwm.objectives.world_model import Term, WorldModelLoss, visible_position_reconstruction
+
+LatentDistance = Literal["cosine", "mse"]
+PositionalGradient = Literal["encoder", "latent", "both"]
 
 
 def instance_masks(masks: Tensor) -> Tensor:
     """Masks of objects and background that share the pixels out: each belongs to its first object, or to none.
 
     Args:
-        masks: ``[..., O, H, W]`` bool.
+        masks: ``[..., O, H, W]`` bool, or integers that are 0 outside.
 
     Returns:
         ``[..., O + 1, H, W]`` bool, the background last.
@@ -31,6 +34,7 @@ def instance_masks(masks: Tensor) -> Tensor:
                 [0, 0, 0],
                 [0, 0, 1]], dtype=torch.int32)
     """
+    masks = flags(masks, "masks")
     taken = masks.cumsum(-3) - masks.long() > 0
     return torch.cat([masks & ~taken, ~masks.any(-3, keepdim=True)], -3)
 
@@ -55,7 +59,7 @@ def object_reconstruction(colours: Tensor, pixels: Tensor, masks: Tensor) -> Ten
 
     Args:
         colours: ``[*batch, O + 1, 3, H, W]`` in [0, 1].
-        pixels: ``[*batch, 3, H, W]`` uint8.
+        pixels: ``[*batch, 3, H, W]`` uint8, or floating point in [0, 1].
         masks: ``[*batch, O, H, W]`` bool. The mask of a hidden object is empty, so that it adds nothing.
 
     Examples:
@@ -67,26 +71,8 @@ def object_reconstruction(colours: Tensor, pixels: Tensor, masks: Tensor) -> Ten
     true = instance_masks(masks)
     # No pixel belongs to two instances, so that one squared error per pixel is enough.
     predicted = (colours.float() * true.unsqueeze(-3)).sum(-4)
-    error = (predicted - pixels.float() / 255 * true.any(-3).unsqueeze(-3)).square()
+    error = (predicted - unit_image(pixels) * true.any(-3).unsqueeze(-3)).square()
     return error.sum((-3, -2, -1)).mean()
-
-
-def visible_position_reconstruction(prediction: Tensor, target: Tensor, visible: Tensor) -> Tensor:
-    """Squared error of the positions of visible objects in symlog space, summed, and averaged over the batch.
-
-    Args:
-        prediction: ``[*batch, O * D]``.
-        target: ``[*batch, O * D]``.
-        visible: ``[*batch, O]`` bool.
-
-    Examples:
-        >>> error = visible_position_reconstruction(torch.zeros(1, 4), torch.full((1, 4), torch.e - 1),
-        ...     torch.tensor([[True, False]]))
-        >>> error
-        tensor(2.)
-    """
-    error = (symlog(prediction.float()) - symlog(target)).square().unflatten(-1, (visible.shape[-1], -1))
-    return (error.sum(-1) * visible).sum(-1).mean()
 
 
 def positional_latent_loss(
@@ -94,8 +80,8 @@ def positional_latent_loss(
     extracted: Tensor,
     visible: Tensor,
     *,
-    distance: Literal["cosine", "mse"] = "cosine",
-    gradient: Literal["encoder", "latent", "both"] = "both",
+    distance: LatentDistance = "cosine",
+    gradient: PositionalGradient = "both",
 ) -> Tensor:
     """How far latents encoded from positions are from those of the objects there, averaged over the batch (L_pos).
 
@@ -106,11 +92,16 @@ def positional_latent_loss(
         distance: Minus the cosine similarity, or the mean squared error.
         gradient: What is trained: the positional encoder, the latents, or both.
 
+    Raises:
+        ValueError: for another distance or gradient.
+
     Examples:
         >>> latent = torch.tensor([[[3.0, 4.0]]])
         >>> positional_latent_loss(latent, 2 * latent, torch.tensor([[True]]))
         tensor(-1.)
     """
+    check_choice("distance", distance, LatentDistance)
+    check_choice("gradient", gradient, PositionalGradient)
     if gradient == "encoder":
         extracted = extracted.detach()
     elif gradient == "latent":
@@ -119,14 +110,14 @@ def positional_latent_loss(
         loss = -cosine_similarity(predicted.float(), extracted.float(), dim=-1)
     else:
         loss = (predicted.float() - extracted.float()).square().mean(-1)
-    return (loss * visible).sum(-1).mean()
+    return (loss * flags(visible, "object_visible")).sum(-1).mean()
 
 
 class FOCUSModelLoss(WorldModelLoss):
     """The world model's loss with a term for each thing that is decoded of an object.
 
-    :class:`~torchrl_ocwm.objectives.WorldModelLoss`, whose image term makes room for masks and masked colours. Object
-    positions count where the object is visible. With a positional encoder the loss that trains it is added.
+    :class:`~torchrl_ocwm.objectives.WorldModelLoss`, whose image term makes room for masks and masked colours. With a
+    positional encoder the loss that trains it is added.
 
     Args:
         world_model: Reads records ``[B, T]``, writes posterior, prior and predictions under ``next``.
@@ -135,9 +126,13 @@ class FOCUSModelLoss(WorldModelLoss):
         lambda_positional: Weight of L_pos.
         lambda_image_latent: Weight of what makes an image alone a goal: the position in it, weighted like the object
             positions too, and minus the cosine similarity of its object latents and those of the whole observation.
-        positional_distance: ``"cosine"`` or ``"mse"``.
-        positional_gradient: What L_pos trains: ``"encoder"``, ``"latent"`` or ``"both"``.
-        kwargs: The arguments of :class:`~torchrl_ocwm.objectives.WorldModelLoss`.
+        positional_distance: ``"cosine"``, the default, or ``"mse"``.
+        positional_gradient: What L_pos trains: ``"encoder"``, ``"latent"`` or ``"both"``, the default.
+        kwargs: The arguments of :class:`~torchrl_ocwm.objectives.WorldModelLoss`, but for ``lambda_pixels``.
+
+    Raises:
+        ValueError: for an unknown distance or gradient, and as :class:`~torchrl_ocwm.objectives.WorldModelLoss` does,
+            for a setting of a term that the world model does not predict.
 
     Examples:
         >>> from torchrl_ocwm.agents import build_agent
@@ -158,7 +153,6 @@ class FOCUSModelLoss(WorldModelLoss):
             mask_logits (NestedKey): Predicted logits, ``[B, T, O + 1, H, W]``. Defaults to ``"mask_logits"``.
             reco_object_pixels (NestedKey): Predicted colours, ``[B, T, O + 1, 3, H, W]``. Defaults to
                 ``"reco_object_pixels"``.
-            object_visible (NestedKey): Which objects are seen, ``[B, T, O]`` bool. Defaults to ``"object_visible"``.
             object_latent (NestedKey): Extracted latents, ``[B, T, O + 1, L]``. Defaults to ``"object_latent"``.
             positional_latent (NestedKey): Latents encoded from positions, ``[B, T, O, L]``. Defaults to
                 ``"positional_latent"``.
@@ -171,7 +165,6 @@ class FOCUSModelLoss(WorldModelLoss):
         masks: NestedKey = "masks"
         mask_logits: NestedKey = "mask_logits"
         reco_object_pixels: NestedKey = "reco_object_pixels"
-        object_visible: NestedKey = "object_visible"
         object_latent: NestedKey = "object_latent"
         positional_latent: NestedKey = "positional_latent"
         image_latent: NestedKey = "image_latent"
@@ -179,65 +172,61 @@ class FOCUSModelLoss(WorldModelLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    _reconstructed = ("proprio", "goal_position")  # the rest is decoded object by object
 
     def __init__(
         self,
         world_model: TensorDictModuleBase,
         *,
-        lambda_masks: float = 1.0,
-        lambda_object_pixels: float = 1.0,
-        lambda_positional: float = 1.0,
-        lambda_image_latent: float = 1.0,
-        positional_distance: Literal["cosine", "mse"] = "cosine",
-        positional_gradient: Literal["encoder", "latent", "both"] = "both",
+        lambda_masks: float | None = None,
+        lambda_object_pixels: float | None = None,
+        lambda_positional: float | None = None,
+        lambda_image_latent: float | None = None,
+        positional_distance: LatentDistance | None = None,
+        positional_gradient: PositionalGradient | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(world_model, **kwargs)
-        self.lambda_masks, self.lambda_object_pixels = lambda_masks, lambda_object_pixels
-        self.lambda_positional, self.lambda_image_latent = lambda_positional, lambda_image_latent
-        self.positional_distance: Literal["cosine", "mse"] = positional_distance
-        self.positional_gradient: Literal["encoder", "latent", "both"] = positional_gradient
-
-    @property
-    def targets(self) -> list[NestedKey]:
-        """What the losses compare predictions with."""
-        keys = self.tensor_keys
-        return [*super().targets, unravel_key(("next", keys.masks)), unravel_key(("next", keys.object_visible))]
-
-    def _reconstruction_losses(self, records: TensorDictBase) -> dict[str, Tensor]:
-        keys = self.tensor_keys
-        pixels, masks, visible = (self._next(records, key) for key in (keys.pixels, keys.masks, keys.object_visible))
-        losses = super()._reconstruction_losses(records)
-        # L_obj (paper, appendix): first the masks, then the colours inside the true masks.
-        masks_error = mask_nll(self._next(records, keys.mask_logits), masks)
-        colours_error = object_reconstruction(self._next(records, keys.reco_object_pixels), pixels, masks)
-        position_error = visible_position_reconstruction(
-            self._next(records, keys.reco_object_position), self._next(records, keys.object_position), visible
+        self._set_weights(
+            masks=lambda_masks,
+            object_pixels=lambda_object_pixels,
+            positional=lambda_positional,
+            image_latent=lambda_image_latent,
         )
-        losses["loss_model_masks"] = self.lambda_masks * masks_error
-        losses["loss_model_object_pixels"] = self.lambda_object_pixels * colours_error
-        losses["loss_model_object_position"] = self.lambda_object_position * position_error
-        losses.update(self._goal_latent_losses(records, visible))
-        return losses
+        for name, value in (("positional_distance", positional_distance), ("positional_gradient", positional_gradient)):
+            if value is not None:
+                self._given[name] = "positional"
+        self.positional_distance: LatentDistance = positional_distance or "cosine"
+        self.positional_gradient: PositionalGradient = positional_gradient or "both"
+        check_choice("positional_distance", self.positional_distance, LatentDistance)
+        check_choice("positional_gradient", self.positional_gradient, PositionalGradient)
 
-    def _goal_latent_losses(self, records: TensorDictBase, visible: Tensor) -> dict[str, Tensor]:
-        """What the two kinds of goals are encoded with: of a position, and of an image alone."""
-        keys, losses = self.tensor_keys, {}
-        predicted, alone = self._next(records, keys.positional_latent), self._next(records, keys.image_latent)
-        latent = self._next(records, keys.object_latent)[..., :-1, :]
-        if predicted is not None:
-            error = positional_latent_loss(
-                predicted, latent, visible, distance=self.positional_distance, gradient=self.positional_gradient
-            )
-            losses["loss_model_positional"] = self.lambda_positional * error  # L_pos
-        if alone is not None:
-            error = positional_latent_loss(
-                alone[..., :-1, :], latent, visible, distance=self.positional_distance, gradient="encoder"
-            )
-            losses["loss_model_image_latent"] = self.lambda_image_latent * error
-            error = visible_position_reconstruction(
-                self._next(records, keys.reco_image_position), self._next(records, keys.object_position), visible
-            )
-            losses["loss_model_image_position"] = self.lambda_image_latent * self.lambda_object_position * error
-        return losses
+    def terms(self) -> dict[str, Term]:
+        """Masks and masked colours in place of the image, and what the two kinds of goals are encoded with."""
+        terms = super().terms()
+        del terms["pixels"]
+        return {
+            **terms,
+            # L_obj (paper, appendix): first the masks, then the colours inside the true masks.
+            "masks": Term("mask_logits", ("masks",), mask_nll),
+            "object_pixels": Term("reco_object_pixels", ("pixels", "masks"), object_reconstruction),
+            "positional": Term("positional_latent", ("object_latent", "object_visible"), self._positional),  # L_pos
+            "image_latent": Term("image_latent", ("object_latent", "object_visible"), self._image_latent),
+            "image_position": Term(
+                "reco_image_position", ("object_position", "object_visible"), visible_position_reconstruction
+            ),
+        }
+
+    def weight(self, term: str) -> float:
+        """The weight of a term; the position in an image alone has both weights that it is about."""
+        if term == "image_position":
+            return self.lambda_image_latent * self.lambda_object_position
+        return super().weight(term)
+
+    def _positional(self, predicted: Tensor, latent: Tensor, visible: Tensor) -> Tensor:
+        objects = latent[..., :-1, :]
+        distance, gradient = self.positional_distance, self.positional_gradient
+        return positional_latent_loss(predicted, objects, visible, distance=distance, gradient=gradient)
+
+    def _image_latent(self, alone: Tensor, latent: Tensor, visible: Tensor) -> Tensor:
+        objects, distance = latent[..., :-1, :], self.positional_distance
+        return positional_latent_loss(alone[..., :-1, :], objects, visible, distance=distance, gradient="encoder")
