@@ -13,6 +13,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_ocwm.data.collect import collect
+from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.training.config import recipe
 
 
@@ -21,10 +22,13 @@ def main(config: DictConfig) -> None:
     dataset = collect(
         config.dataset,
         config.env.name,
-        config.steps,
-        policy=config.policy,
-        workers=config.workers,
-        seed=config.seed,
+        Collection(
+            steps=config.steps,
+            policy=config.policy,
+            workers=config.workers,
+            seed=config.seed,
+            timeout=config.timeout,
+        ),
         options=OmegaConf.to_container(config.env.options, resolve=True),
     )
     index = dataset.metadata
@@ -33,7 +37,7 @@ def main(config: DictConfig) -> None:
     for name, seen in index["coverage"].items():
         print(f"{name}: moves in {seen['moves']:.0%} of the steps, visits {seen['visited']:.0%} of the workspace")
     if index.get("failures"):
-        print(f"the simulator failed {index['failures']} times")
+        print(f"{index['failures']} episodes failed and were left out")
 
 
 if __name__ == "__main__":

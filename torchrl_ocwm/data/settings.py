@@ -13,9 +13,10 @@ class Collection:
         steps: Environment steps to reach; whole episodes are collected, so there may be a few more.
         policy: Who acts: ``"random"`` for smooth random actions, ``"scripted"`` for scripted ones with noise
             (:class:`~torchrl_ocwm.data.ScriptedPolicy`), or the checkpoint of an agent, which then explores.
-        workers: Processes that step one environment each.
+        workers: Processes that play one episode each at a time; 0 plays them in this one. The episodes do not depend on
+            it.
         seed: Seeds environments and actions.
-        timeout: Seconds without a sign of life from a process after which all processes are replaced.
+        timeout: Seconds without a step after which a process counts as hanging and is replaced.
 
     Raises:
         ValueError: for a setting out of its range, with its name.
@@ -32,8 +33,8 @@ class Collection:
     timeout: float = 120.0
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "steps", "workers")
-        check_at_least(self, 0, "seed")
+        check_at_least(self, 1, "steps")
+        check_at_least(self, 0, "workers", "seed")
         check_above_zero(self, "timeout")
 
 
