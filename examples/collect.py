@@ -14,21 +14,17 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_ocwm.data.collect import collect
 from torchrl_ocwm.data.settings import Collection
-from torchrl_ocwm.training.config import recipe
+from torchrl_ocwm.signals import ended_by_signals
+from torchrl_ocwm.training.config import part_of, recipe
 
 
 @recipe(Path(__file__).parent / "config", "collect")
+@ended_by_signals()
 def main(config: DictConfig) -> None:
     dataset = collect(
         config.dataset,
         config.env.name,
-        Collection(
-            steps=config.steps,
-            policy=config.policy,
-            workers=config.workers,
-            seed=config.seed,
-            timeout=config.timeout,
-        ),
+        part_of(config, Collection),
         options=OmegaConf.to_container(config.env.options, resolve=True),
     )
     index = dataset.metadata

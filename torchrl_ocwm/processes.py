@@ -125,6 +125,8 @@ class ProcessWorker:
             WorkerError: if the process has ended, or hangs.
         """
         answer: Any = _SIGN
+        if self._socket.fileno() < 0:
+            raise WorkerError("the process was closed")
         try:
             while answer is _SIGN:
                 answer = pickle.load(self._answers)

@@ -184,8 +184,8 @@ class EvaluationEnvs:
 
     def close(self) -> None:
         """Close the environments and end the processes."""
-        while self._workers:
-            self._workers.pop().close()
+        for worker in self._workers:
+            worker.close()
 
     def __enter__(self) -> EvaluationEnvs:
         return self

@@ -11,7 +11,8 @@ from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, measure
 class LandmarkEvaluation:
     """Evaluate an agent on its task's landmark goals, in this process.
 
-    The paper draws its training curves with ten such goals. The environments are made at the first call and kept.
+    The paper draws its training curves with ten such goals. The environments are made at the first call and kept until
+    it is closed.
 
     Args:
         agent: The agent in training.
@@ -19,22 +20,27 @@ class LandmarkEvaluation:
         episode_steps: Steps of each.
 
     Raises:
-        ValueError: when called, if there are more episodes than landmarks.
+        ValueError: if there are more episodes than landmarks.
     """
 
     def __init__(self, agent: Agent, *, episodes: int, episode_steps: int) -> None:
-        self.policy, self.task = agent.policy(), agent.task
-        self.episodes, self.episode_steps = episodes, episode_steps
-        self.envs: EvaluationEnvs | None = None
+        landmarks = agent.task.workspace.landmarks
+        if episodes > len(landmarks):
+            raise ValueError(f"{episodes} evaluation episodes, but {agent.task.name} has {len(landmarks)} landmarks")
+        self.policy, self.goals = agent.policy(), torch.tensor(landmarks[:episodes])
+        self.envs = EvaluationEnvs(agent.task, episode_steps=episode_steps, workers=0, envs=episodes)
 
     def __call__(self, updates: int) -> dict[str, float]:  # noqa: ARG002
         """Scores to log."""
-        landmarks = self.task.workspace.landmarks
-        if self.episodes > len(landmarks):
-            raise ValueError(
-                f"{self.episodes} evaluation episodes, but {self.task.name} has {len(landmarks)} landmarks"
-            )
-        if self.envs is None:
-            self.envs = EvaluationEnvs(self.task, episode_steps=self.episode_steps, workers=0, envs=self.episodes)
-        scores = measure(self.envs.run(self.policy, torch.tensor(landmarks[: self.episodes])))
-        return {f"evaluation/{name}": float(values.mean()) for name, values in scores.items()}
+        scores = measure(self.envs.run(self.policy, self.goals))
+        return {f"evaluation/{name}": float(values.nanmean()) for name, values in scores.items()}
+
+    def close(self) -> None:
+        """Close the environments; a later call makes them again."""
+        self.envs.close()
+
+    def __enter__(self) -> LandmarkEvaluation:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()

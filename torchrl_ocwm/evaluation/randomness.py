@@ -18,7 +18,7 @@ _DRAWS: dict[Any, Callable[..., Tensor]] = {
 
 
 class EpisodeRandomness(TorchFunctionMode):
-    """Within it, each row of what :func:`torch.rand`, ``randn``, ``rand_like`` and ``randn_like`` draw is of an episode.
+    """Within it, what :func:`torch.rand`, ``randn``, ``rand_like`` and ``randn_like`` draw is drawn row by row.
 
     The world model of a policy that acts draws its states with :func:`torch.rand`, for all episodes of a batch at
     once. With a generator for each episode an episode is played the same in any batch.
@@ -48,9 +48,10 @@ class EpisodeRandomness(TorchFunctionMode):
             return func(*args, **kwargs)
         # The shape, dtype and device that were asked for, on meta: no number is drawn.
         like = func(*args, **{**kwargs, "device": "meta"})
-        device = kwargs.get("device", args[0].device if isinstance(args[0], Tensor) else None)
-        if like.numel() % len(self.generators):
-            raise ValueError(f"{tuple(like.shape)} random numbers cannot be shared out among {len(self.generators)} episodes")
-        each, draw = like.numel() // len(self.generators), _DRAWS[func]
+        device = kwargs.get("device", args[0].device if args and isinstance(args[0], Tensor) else None)
+        episodes = len(self.generators)
+        if like.numel() % episodes:
+            raise ValueError(f"random numbers {tuple(like.shape)} cannot be shared out among {episodes} episodes")
+        each, draw = like.numel() // episodes, _DRAWS[func]
         rows = [draw(each, dtype=like.dtype, generator=generator) for generator in self.generators]
         return torch.cat(rows).reshape(like.shape).to(device)

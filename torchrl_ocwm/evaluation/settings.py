@@ -21,8 +21,8 @@ class Evaluation:
         workers: Processes; 0 steps all environments in the process that evaluates. Scores do not depend on it.
         envs: Environments stepped in each process. Scores do not depend on it.
         video_goals: Goals that the video shows, all if they are fewer; 0 for no video.
-        seed: Seeds the start states, and random actions.
-        timeout: Seconds without a sign of life from a process after which the evaluation ends.
+        seed: Seeds the episodes: start states, what the world model draws, and random actions.
+        timeout: Seconds without a step after which a process counts as hanging, and the evaluation ends.
 
     Raises:
         ValueError: for a setting out of its range, with its name.

@@ -93,6 +93,12 @@ def keep_config(config: DictConfig) -> None:
         OmegaConf.save(config, Path(hydra_config.runtime.output_dir) / hydra_config.output_subdir / "config.yaml")
 
 
+def part_of(config: DictConfig, kind: type[T]) -> T:
+    """A dataclass from those keys of a configuration that are its fields."""
+    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    return to_dataclass(kind, OmegaConf.masked_copy(config, names))
+
+
 def to_dataclass(kind: type[T], config: DictConfig) -> T:
     """A dataclass from a node of a configuration.
 
