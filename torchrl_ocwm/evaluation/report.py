@@ -159,12 +159,9 @@ class Report:
         for agent, row in self.rows.items():
             cells = [_cell(self.summary(agent, name), COLUMNS[name][1]) for name in columns]
             lines.append("| " + " | ".join([agent, str(len(row.seeds)), *cells]) + " |")
-        undefined = int(score_is_undefined(self.goals).sum())
-        if undefined:
-            lines += [
-                "",
-                f"{undefined} of {len(self.goals)} goals lie at the start: they have no score, only a distance.",
-            ]
+        at_start = int(score_is_undefined(self.goals).sum())
+        if at_start:
+            lines += ["", f"Without a score, as they lie at the start: {at_start} of {len(self.goals)} goals."]
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
