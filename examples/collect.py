@@ -8,32 +8,39 @@ Can be stopped at any moment and run again: it goes on where it was. Run with an
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from omegaconf import DictConfig, OmegaConf
+from dataclasses import dataclass
 
 from torchrl_ocwm.data.collect import collect
-from torchrl_ocwm.training.config import recipe
+from torchrl_ocwm.data.settings import Collection
+from torchrl_ocwm.envs.registry import EnvChoice
+from torchrl_ocwm.recipes import recipe
+from torchrl_ocwm.signals import ended_by_signals
 
 
-@recipe(Path(__file__).parent / "config", "collect")
-def main(config: DictConfig) -> None:
-    dataset = collect(
-        config.dataset,
-        config.env.name,
-        config.steps,
-        policy=config.policy,
-        workers=config.workers,
-        seed=config.seed,
-        options=OmegaConf.to_container(config.env.options, resolve=True),
-    )
+@dataclass(frozen=True, kw_only=True)
+class Collect(Collection):
+    """Settings of the recipe.
+
+    Args:
+        env: Where to collect.
+        dataset: Folder of the dataset. One that is there already is continued.
+    """
+
+    env: EnvChoice
+    dataset: str = "data/${env.name}"
+
+
+@recipe("collect", {"env": "reacher"})
+@ended_by_signals()
+def main(config: Collect) -> None:
+    dataset = collect(config.dataset, config.env.name, config, options=dict(config.env.options))
     index = dataset.metadata
     policies = ", ".join(f"{number} {policy}" for policy, number in index.get("policies", {}).items())
     print(f"{dataset.path}: {dataset.num_steps} steps in {len(dataset.episode_lengths)} episodes ({policies})")
     for name, seen in index["coverage"].items():
         print(f"{name}: moves in {seen['moves']:.0%} of the steps, visits {seen['visited']:.0%} of the workspace")
     if index.get("failures"):
-        print(f"the simulator failed {index['failures']} times")
+        print(f"{index['failures']} episodes failed and were left out")
 
 
 if __name__ == "__main__":

@@ -5,13 +5,11 @@ How well it sees and imagines masks and positions of the objects, and whether go
 
 from __future__ import annotations
 
-import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -23,8 +21,13 @@ from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
 from torchrl_ocwm.evaluation.object_pictures import draw_errors, draw_goal_latents, picture_objects
 from torchrl_ocwm.evaluation.objects import object_errors
 from torchrl_ocwm.evaluation.open_loop import random_sequences
+from torchrl_ocwm.evaluation.output import writing
+from torchrl_ocwm.evaluation.report import to_json
+from torchrl_ocwm.evaluation.settings import Diagnosis
 from torchrl_ocwm.modules import ObjectWorldModel
-from torchrl_ocwm.training.config import recipe
+from torchrl_ocwm.recipes import recipe
+from torchrl_ocwm.settings import to_dict
+from torchrl_ocwm.signals import ended_by_signals
 
 GOALS = {
     "cosine": ("cosine", 3),
@@ -37,52 +40,65 @@ GOALS = {
 }
 
 
-@recipe(Path(__file__).parent / "config", "diagnose")
-def main(config: DictConfig) -> None:
-    agent = load_agent(config.checkpoint, device=config.device).agent
-    records = _records(config, agent.task)
-    output = Path(config.output)
-    output.mkdir(parents=True, exist_ok=True)
-    torch.manual_seed(config.seed)
-    errors, goals = _errors(agent, records, config, output), _goals(agent, records, config, output)
+@dataclass(frozen=True, kw_only=True)
+class Diagnose(Diagnosis):
+    """Settings of the recipe.
+
+    Args:
+        checkpoint: Checkpoint of the agent whose world model is examined.
+        dataset: Folder of a dataset of the same task.
+        output: Folder for table, numbers, pictures and video.
+    """
+
+    checkpoint: str
+    dataset: str
+    output: str = "outputs/diagnosis"
+
+
+@recipe("diagnose")
+@ended_by_signals()
+def main(config: Diagnose) -> None:
+    settings, output = config, Path(config.output)
+    agent = load_agent(config.checkpoint, device=settings.device).agent
+    records = _records(Path(config.dataset), config.checkpoint, agent.task, settings)
+    torch.manual_seed(settings.seed)
+    errors, goals = _errors(agent, records, settings, output), _goals(agent, records, settings, output)
     table = "\n\n".join(part for part in (_error_table(errors, agent.task.objects), _goal_table(goals)) if part)
-    numbers = {"settings": {**config}, "objects": agent.task.objects, "errors": errors, "goal_latents": goals}
-    (output / "diagnosis.json").write_text(json.dumps(_plain(numbers), indent=1) + "\n")
-    (output / "diagnosis.md").write_text(table + "\n")
+    numbers = {"settings": to_dict(config), "objects": agent.task.objects, "errors": errors, "goal_latents": goals}
+    with writing(output / "diagnosis.json") as file:
+        file.write_text(to_json(numbers))
+    with writing(output / "diagnosis.md") as file:
+        file.write_text(table + "\n")
     print(table)
     print(f"\ntable, numbers, pictures: {output}")
 
 
-def _records(config: DictConfig, task: Task) -> TensorDictBase:
-    dataset = EpisodeDataset.open(config.dataset)
+def _records(path: Path, checkpoint: str, task: Task, settings: Diagnosis) -> TensorDictBase:
+    dataset = EpisodeDataset.open(path)
     there = Task.from_dict(dataset.metadata["task"])
     if there != task:
-        raise ValueError(f"{dataset.path}: holds {there}, but the agent in {config.checkpoint} is of {task}")
-    if not 0 < config.context < config.length:
-        raise ValueError(
-            f"context={config.context} of length={config.length} frames: some have to be seen and some to be imagined"
-        )
-    records = random_sequences(dataset, config.sequences, config.length, seed=config.seed)
-    return records.to(config.device)
+        raise ValueError(f"{dataset.path}: holds {there}, but the agent in {checkpoint} is of {task}")
+    records = random_sequences(dataset, settings.sequences, settings.length, seed=settings.seed)
+    return records.to(settings.device)
 
 
-def _errors(agent: Agent, records: TensorDictBase, config: DictConfig, output: Path) -> dict[str, dict[str, Tensor]]:
+def _errors(agent: Agent, records: TensorDictBase, settings: Diagnosis, output: Path) -> dict[str, dict[str, Tensor]]:
     """Masks and positions; the pictures of each object, if the world model has any."""
     model, names = agent.model, agent.task.objects
-    errors = object_errors(model, records, config.context)
+    errors = object_errors(model, records, settings.context)
     if errors["imagined"]:
         draw_errors(output / "errors.png", errors, names)
-    if isinstance(model, ObjectWorldModel) and config.video_sequences:
-        picture_objects(output, model, records[: config.video_sequences], config.context, names)
+    if isinstance(model, ObjectWorldModel) and settings.video_sequences:
+        picture_objects(output, model, records[: settings.video_sequences], settings.context, names)
     return errors
 
 
-def _goals(agent: Agent, records: TensorDictBase, config: DictConfig, output: Path) -> dict[str, dict[str, float]]:
+def _goals(agent: Agent, records: TensorDictBase, settings: Diagnosis, output: Path) -> dict[str, dict[str, float]]:
     """Goal latents of the object that is to be positioned, if the agent has such."""
     model = agent.model
     if not isinstance(model, ObjectWorldModel) or model.positional_encoder is None:
         return {}
-    pairs, positions = latent_pairs(model, records, frames=config.frames, seed=config.seed)
+    pairs, positions = latent_pairs(model, records, frames=settings.frames, seed=settings.seed)
     draw_goal_latents(output / "goal_latents.png", pairs, positions)
     return {name: match(*pair, positions) for name, pair in pairs.items()}
 
@@ -113,15 +129,6 @@ def _goal_table(goals: dict[str, dict[str, float]]) -> str:
         cells = [f"{values[key]:.{digits}f}" for key, (_, digits) in GOALS.items()]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
-
-
-def _plain(values: Any) -> Any:
-    """Tensors as lists; JSON has no NaN, so that it becomes ``None``."""
-    if isinstance(values, dict):
-        return {name: _plain(value) for name, value in values.items()}
-    if isinstance(values, (list, tuple, Tensor)):
-        return [_plain(value) for value in (values.tolist() if isinstance(values, Tensor) else values)]
-    return None if isinstance(values, float) and math.isnan(values) else values
 
 
 if __name__ == "__main__":

@@ -5,16 +5,21 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from hashlib import sha256
 from pathlib import Path
 
 import gymnasium
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm import load_agent
 from torchrl_ocwm.agents import Agent, Policy, agent_name
+from torchrl_ocwm.agents.checkpoint import describe
 from torchrl_ocwm.data import SmoothRandomPolicy
 from torchrl_ocwm.envs import ENVIRONMENTS, Task
 from torchrl_ocwm.evaluation import (
@@ -31,9 +36,11 @@ from torchrl_ocwm.evaluation import (
 from torchrl_ocwm.evaluation.object_pictures import draw_errors, picture_objects
 from torchrl_ocwm.evaluation.objects import object_errors
 from torchrl_ocwm.evaluation.plots import heatmap, learning_curves
+from torchrl_ocwm.evaluation.settings import Evaluation
 from torchrl_ocwm.evaluation.videos import decode_video, mark, tile, write_video
 from torchrl_ocwm.modules import ObjectWorldModel
-from torchrl_ocwm.training.config import recipe
+from torchrl_ocwm.recipes import recipe
+from torchrl_ocwm.signals import ended_by_signals
 from torchrl_ocwm.training.offline import CHECKPOINT
 
 CONTEXT = 5  # frames that are seen before the objects are imagined
@@ -46,45 +53,91 @@ CURVES = {
 }
 
 
-@recipe(Path(__file__).parent / "config", "evaluate")
-def main(config: DictConfig) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Evaluation):
+    """Settings of the recipe.
+
+    Args:
+        checkpoint: Checkpoint, or list of them: those of one agent count as its seeds, each agent is a row.
+        include: ``results.json`` of earlier evaluations with the same goals and settings, whose rows come first.
+        output: Folder for table, numbers, heatmaps, learning curve and video.
+    """
+
+    checkpoint: str | tuple[str, ...]
+    include: tuple[str, ...] = ()
+    output: str = "outputs/evaluation"
+
+
+@recipe("evaluate")
+@ended_by_signals()
+def main(config: Evaluate) -> None:
+    settings = config
     files = [Path(one) for one in ([config.checkpoint] if isinstance(config.checkpoint, str) else config.checkpoint)]
     policies = [load_agent(file) for file in files]
-    task = _one_task(policies, files)
-    size = round(config.goals**0.5)
-    if size * size != config.goals or size < 1:
-        raise ValueError(f"goals={config.goals} is not a square grid; try {size * size}")
-    goals = task.workspace.grid(size).flatten(0, 1)
-    images = goal_images(task, goals) if config.image_goals else None
-    output = Path(config.output)
-    report = Report(goals, {key: config[key] for key in ("goals", "episode_steps", "seed")})
-    for file in config.include:
-        report.include(Report.load(file))
-    torch.manual_seed(config.seed)
-    envs = EvaluationEnvs(
-        task, episode_steps=config.episode_steps, workers=config.workers, envs=min(config.envs, config.goals)
-    )
-    with envs:
-        if config.random:
-            report.add("random", measure(envs.run(SmoothRandomPolicy(task.action), goals)), source="smooth actions")
-        for policy, file in zip(policies, files, strict=True):
+    task, output = _one_task(policies, files), Path(config.output)
+    goals = task.workspace.grid(settings.grid_size).flatten(0, 1)
+    images = goal_images(task, goals) if settings.image_goals else None
+    report = _report(goals, settings, config.include)
+    runs = _runs(files, policies, report)
+    with EvaluationEnvs(
+        task,
+        episode_steps=settings.episode_steps,
+        workers=settings.workers,
+        envs=settings.envs,
+        timeout=settings.timeout,
+    ) as envs:
+        if settings.random and "random" not in report.rows:
+            played = envs.run(SmoothRandomPolicy(task.action), goals, seed=settings.seed, progress=True)
+            report.add("random", measure(played), source="smooth actions")
+        for policy, run in zip(policies, runs, strict=True):
             name = agent_name(policy.agent.config)
-            report.add(name, _evaluate(policy, envs, goals, config.seed), source=str(file))
+            report.add(name, _evaluate(policy, envs, goals, settings.seed), **run)
             if images is not None and policy.takes_images:
-                seen = _evaluate(policy, envs, goals, config.seed, images)
-                report.add(name + IMAGE_GOALS, seen, source=str(file))
+                report.add(name + IMAGE_GOALS, _evaluate(policy, envs, goals, settings.seed, images), **run)
         report.save(output)
-        heatmap(output / "heatmap.png", report.per_goal("final_score"), task.workspace, title="final score")
-        if config.video_goals:
-            chosen = torch.linspace(0, len(goals) - 1, config.video_goals).round().long()
-            episodes = _film(policies[-1], envs, goals[chosen], output / "episodes.mp4")
-            _picture_objects(policies[-1].agent, episodes, output)
+        print(report.markdown())
+        _draw(report, task, output)
+        if settings.video_goals:
+            chosen = torch.linspace(0, len(goals) - 1, min(settings.video_goals, settings.goals)).round().long()
+            film = partial(_film, policies[-1], envs, goals, chosen, settings.seed)
+            _picture_objects(policies[-1].agent, film(output / "episodes.mp4"), output)
             if images is not None and policies[-1].takes_images:
-                _film(policies[-1], envs, goals[chosen], output / "episodes_image_goals.mp4", images[chosen])
-    runs = {name: _folders(sources) for name, sources in report.sources.items() if not name.endswith(IMAGE_GOALS)}
-    learning_curves(output / "learning_curve.png", runs, CURVES)
-    print(report.markdown())
+                film(output / "episodes_image_goals.mp4", images)
     print(f"\ntable, numbers, heatmap, learning curve, videos: {output}")
+
+
+def _report(goals: Tensor, settings: Evaluation, include: Sequence[str]) -> Report:
+    """An empty report, or one with the rows of earlier ones."""
+    kept = {"goals": settings.goals, "episode_steps": settings.episode_steps, "seed": settings.seed}
+    report = Report(goals, {**kept, "starts": "by goal"})  # earlier releases: by place among the environments
+    for file in include:
+        report.include(Report.load(file))
+    return report
+
+
+def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dict[str, str]]:
+    """What a report keeps of each checkpoint: where it is, what is in it, and of what kind its agent is.
+
+    Raises:
+        ValueError: for one that would count twice.
+    """
+    seen = {run: source for row in report.rows.values() for run, source in zip(row.runs, row.sources, strict=True)}
+    runs = []
+    for file, policy in zip(files, policies, strict=True):
+        run = sha256(file.read_bytes()).hexdigest()
+        if run in seen:
+            raise ValueError(f"{file}: the same run as {seen[run]}, which counts already; leave one of them out")
+        seen[run] = str(file)
+        kind = sha256(json.dumps(describe(policy.agent), sort_keys=True).encode()).hexdigest()
+        runs.append({"source": str(file), "run": run, "kind": kind})
+    return runs
+
+
+def _draw(report: Report, task: Task, output: Path) -> None:
+    """Scores over the workspace, and how the agents of each row learnt."""
+    heatmap(output / "heatmap.png", report.per_goal("final_score"), task.workspace, title="final score")
+    runs = {name: _folders(row.sources) for name, row in report.rows.items() if not name.endswith(IMAGE_GOALS)}
+    learning_curves(output / "learning_curve.png", runs, CURVES)
 
 
 def _one_task(policies: list[Policy], files: list[Path]) -> Task:
@@ -110,27 +163,35 @@ def _evaluate(
 
     episodes = envs.run(policy, goals, images=images, seed=seed, inspect=inspect, progress=True)
     errors = {name: episodes[name].mean(1) for name in ("entity_error", "goal_error") if name in episodes}
-    if "object_position" in policy.agent.config.observed:
+    if "object_position" in policy.agent.model.observed:
         errors["imagined_distance"] = imagined_distance(
-            policy.agent, episodes["latent"][:, 0], goals, envs.episode_steps
+            policy.agent, episodes["latent"][:, 0], goals, envs.episode_steps, seed=seed
         )
     return {**measure(episodes), **errors}
 
 
 def _film(
-    policy: Policy, envs: EvaluationEnvs, goals: Tensor, file: Path, images: Tensor | None = None
+    policy: Policy,
+    envs: EvaluationEnvs,
+    goals: Tensor,
+    chosen: Tensor,
+    seed: int,
+    file: Path,
+    images: Tensor | None = None,
 ) -> TensorDictBase:
-    """What happened, the goal as a cross; below, what the agent imagined would happen, from the first frame.
+    """The episodes of a few goals, as they were scored: what happened, the goal as a cross.
 
+    Below, what the agent imagined would happen, from the first frame.
     Above both the goal image, where the agent was given one.
     """
-    task = policy.agent.task
+    task, goals = policy.agent.task, goals[chosen]
+    images = None if images is None else images[chosen]
 
     def inspect(step: TensorDictBase) -> dict[str, TensorDictBase]:
         return {"latent": step["latent"], **transition(step)}
 
-    episodes = envs.run(policy, goals, images=images, inspect=inspect)
-    latents = imagined_rollout(policy.agent, episodes["latent"][:, 0], envs.episode_steps)["latent"]
+    episodes = envs.run(policy, goals, images=images, seed=seed, numbers=chosen, inspect=inspect)
+    latents = imagined_rollout(policy.agent, episodes["latent"][:, 0], envs.episode_steps, seed=seed)["latent"]
     imagined = decode_video(policy.agent.model, latents)
     with gymnasium.make(ENVIRONMENTS[task.name].id, **task.options) as env:
         points = torch.as_tensor(env.unwrapped.project(goals.numpy()))

@@ -13,12 +13,14 @@ import torch
 
 from torchrl_ocwm.agents import AgentConfig, Size, build_agent
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
+from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.envs.registry import EnvChoice
 from torchrl_ocwm.evaluation import LandmarkEvaluation
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm
 from torchrl_ocwm.recipes import keep_settings, recipe, run_folder
 from torchrl_ocwm.settings import Settings
+from torchrl_ocwm.training.memory import check_memory
 from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.settings import Training
 
@@ -55,8 +57,10 @@ def main(config: TrainOffline) -> None:
     # Whatever the command line says: the dataset's options are those that are trained on.
     config = replace(config, env=EnvChoice(config.env.name, dataset.metadata["options"]))
     folder = run_folder(config.output)
+    task = Task.from_dict(dataset.metadata["task"])
+    check_memory(config.agent, task, config.size, usable_device(training.device))
     torch.manual_seed(training.seed)
-    agent = build_agent(config.agent, Task.from_dict(dataset.metadata["task"]), config.size)
+    agent = build_agent(config.agent, task, config.size)
     # Made only if they are used: each checks whether it can do its work before any is done.
     evaluation = film = None
     with ExitStack() as stack:

@@ -1,49 +1,46 @@
 """Collecting with processes: whole, continuous episodes, a folder that can be continued, and only with its own kind."""
 
 import json
+import os
+import signal
 import sys
+import time
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import Checkpoint, CheckpointError
-from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from torchrl_ocwm import build_agent
 from torchrl_ocwm.agents.checkpoint import describe
-from torchrl_ocwm.data import DatasetError, EpisodeDataset, ScriptedPolicy, object_coverage
-from torchrl_ocwm.data.collect import collect
+from torchrl_ocwm.data import DatasetError, EpisodeDataset, ScriptedPolicy, SmoothRandomPolicy, object_coverage
+from torchrl_ocwm.data.collect import EpisodePlayer, collect
+from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import Reacher, Task, make_task
+from torchrl_ocwm.processes import WorkerError
 
 collect_module = sys.modules["torchrl_ocwm.data.collect"]
 OPTIONS = {"horizon": 20, "image_size": 32}
 
 
+def gather(path, steps, *, options=OPTIONS, policy="random", **settings):
+    """Collect Reacher in this process, unless told otherwise, as processes take seconds to start."""
+    module = policy if isinstance(policy, TensorDictModuleBase) else None
+    names = {} if module is not None else {"policy": str(policy)}
+    settings = Collection(**{"steps": steps, "workers": 0, **names, **settings})
+    return collect(path, "reacher", settings, policy=module, options=options, progress=False)
+
+
 @pytest.fixture(scope="module")
 def collected(tmp_path_factory):
     """A run with two processes."""
-    path = tmp_path_factory.mktemp("collect") / "data"
-    return collect(path, "reacher", 100, options=OPTIONS, seed=3, progress=False)
-
-
-class InThisProcess(Collector):
-    """Stands in for the collector with processes, which take seconds to start."""
-
-    def __init__(self, environments, policy, **options):
-        super().__init__(environments[0], policy, **options)
-
-    def set_seed(self, seed, static_seed=False):
-        super().set_seed(seed, static_seed)
-        self.reset()  # seeding resets the simulator; workers look again, too
-
-
-@pytest.fixture
-def no_processes(monkeypatch):
-    monkeypatch.setattr(collect_module, "MultiSyncCollector", InThisProcess)
+    return gather(tmp_path_factory.mktemp("collect") / "data", 100, workers=2, seed=3)
 
 
 @pytest.fixture
 def no_collector(monkeypatch):
-    monkeypatch.setattr(collect_module, "MultiSyncCollector", None)
+    monkeypatch.setattr(collect_module, "play_in_order", None)
 
 
 def episodes(dataset: EpisodeDataset):
@@ -115,11 +112,11 @@ def test_actions_are_smooth_and_bounded(collected):
         assert episode["action"][1:].std() > 0
 
 
-def test_continuing_adds_episodes_and_keeps_the_first(tmp_path, no_processes):
-    first = collect(tmp_path / "data", "reacher", 45, options=OPTIONS, progress=False)
+def test_continuing_adds_episodes_and_keeps_the_first(tmp_path):
+    first = gather(tmp_path / "data", 45)
     before = episodes(first)
     assert len(before) == 3
-    second = collect(tmp_path / "data", "reacher", 85, options=OPTIONS, progress=False)
+    second = gather(tmp_path / "data", 85)
     after = episodes(second)
     assert len(after) == 5
     for old, new in zip(before, after[:3], strict=True):
@@ -129,29 +126,43 @@ def test_continuing_adds_episodes_and_keeps_the_first(tmp_path, no_processes):
         assert not any(torch.equal(old[key][step], new[key][step]) for old in before for new in after[3:])
 
 
-def test_seed_repeats_the_episodes(tmp_path, no_processes):
-    runs = [
-        collect(tmp_path / str(number), "reacher", 20, options=OPTIONS, seed=seed, progress=False).records.clone()
-        for number, seed in enumerate((5, 5, 6))
-    ]
-    assert (runs[0] == runs[1]).all()
-    assert not torch.equal(runs[0]["action"], runs[2]["action"])
-    assert not torch.equal(runs[0]["next", "proprio"][0], runs[2]["next", "proprio"][0])
+def test_seed_and_number_make_an_episode(tmp_path, collected):
+    """Not the processes, nor where the run was interrupted, nor the random numbers of before."""
+    torch.manual_seed(17)
+    gather(tmp_path / "data", 40, seed=3)
+    torch.manual_seed(18)
+    here = gather(tmp_path / "data", 100, seed=3)
+    assert here.episode_lengths == collected.episode_lengths
+    assert (here.records == collected.records).all()
 
 
-def test_interrupted_before_the_first_episode(tmp_path, no_processes, monkeypatch):
+def test_another_seed_makes_other_episodes(tmp_path, collected):
+    other = gather(tmp_path / "data", 20, seed=4).records
+    assert not torch.equal(other["action"], collected.records["action"][:21])
+    assert not torch.equal(other["next", "proprio"][0], collected.records["next", "proprio"][0])
+
+
+def test_random_numbers_around_it_stay(tmp_path):
+    torch.manual_seed(3)
+    expected = torch.rand(2)
+    torch.manual_seed(3)
+    gather(tmp_path / "data", 20)
+    assert torch.equal(torch.rand(2), expected)
+
+
+def test_interrupted_before_the_first_episode(tmp_path, monkeypatch):
     def stop(*arguments, **metadata):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(EpisodeDataset, "append", stop)
         with pytest.raises(KeyboardInterrupt):
-            collect(tmp_path / "data", "reacher", 20, options=OPTIONS, progress=False)
-    dataset = collect(tmp_path / "data", "reacher", 20, options=OPTIONS, progress=False)
+            gather(tmp_path / "data", 20)
+    dataset = gather(tmp_path / "data", 20)
     assert dataset.episode_lengths == [21]
 
 
-def test_interrupted_later_keeps_what_is_there(tmp_path, no_processes, monkeypatch):
+def test_interrupted_later_keeps_what_is_there(tmp_path, monkeypatch):
     append, calls = EpisodeDataset.append, []
 
     def stop_at_the_third(dataset, records, **metadata):
@@ -163,7 +174,7 @@ def test_interrupted_later_keeps_what_is_there(tmp_path, no_processes, monkeypat
     with monkeypatch.context() as patch:
         patch.setattr(EpisodeDataset, "append", stop_at_the_third)
         with pytest.raises(KeyboardInterrupt):
-            collect(tmp_path / "data", "reacher", 100, options=OPTIONS, progress=False)
+            gather(tmp_path / "data", 100)
     kept = episodes(EpisodeDataset.open(tmp_path / "data"))
     assert len(kept) == 2
     for stored, given in zip(kept, calls[:2], strict=True):
@@ -172,7 +183,7 @@ def test_interrupted_later_keeps_what_is_there(tmp_path, no_processes, monkeypat
 
 def test_nothing_to_do(collected, no_collector):
     before = collected.records.clone()
-    again = collect(collected.path, "reacher", 100, options=OPTIONS, progress=False)
+    again = gather(collected.path, 100)
     assert (again.records == before).all()
 
 
@@ -180,34 +191,34 @@ def test_nothing_to_do(collected, no_collector):
 def test_folder_with_other_options(collected, no_collector, options):
     message = rf"{collected.path}: holds a dataset of 'reacher' with options \{{'horizon': 20, .*choose another folder"
     with pytest.raises(DatasetError, match=message):
-        collect(collected.path, "reacher", 1000, options=options, progress=False)
+        gather(collected.path, 1000, options=options)
 
 
-def test_index_counts_the_episodes_of_each_policy(tmp_path, no_processes):
-    collect(tmp_path / "data", "reacher", 40, policy="scripted", options=OPTIONS, progress=False)
-    dataset = collect(tmp_path / "data", "reacher", 100, policy="random", options=OPTIONS, progress=False)
+def test_index_counts_the_episodes_of_each_policy(tmp_path):
+    gather(tmp_path / "data", 40, policy="scripted")
+    dataset = gather(tmp_path / "data", 100, policy="random")
     assert dataset.metadata["policies"] == {"scripted": 2, "random": 3}
     assert dataset.metadata["failures"] == 0
     assert EpisodeDataset.open(tmp_path / "data").metadata == dataset.metadata
 
 
-def test_index_says_how_much_there_is_to_see(tmp_path, no_processes):
+def test_index_says_how_much_there_is_to_see(tmp_path):
     """Also that of a dataset which was continued, or collected before there was such a thing."""
-    dataset = collect(tmp_path / "data", "reacher", 40, options=OPTIONS, progress=False)
+    dataset = gather(tmp_path / "data", 40)
     first = dataset.metadata["coverage"]
     task = make_task("reacher", **OPTIONS)
     position = dataset.records["next", "object_position_true"][:, 0]
     assert first == {"finger": object_coverage(position, dataset.episode_lengths, task.workspace)._asdict()}
     dataset.annotate(coverage=None)
-    assert collect(tmp_path / "data", "reacher", 40, options=OPTIONS, progress=False).metadata["coverage"] == first
-    more = collect(tmp_path / "data", "reacher", 200, options=OPTIONS, progress=False).metadata["coverage"]
+    assert gather(tmp_path / "data", 40).metadata["coverage"] == first
+    more = gather(tmp_path / "data", 200).metadata["coverage"]
     assert more["finger"]["visited"] > first["finger"]["visited"]
 
 
-def test_scripted_policy_goes_where_the_goals_are(tmp_path, no_processes):
+def test_scripted_policy_goes_where_the_goals_are(tmp_path):
     options = {"horizon": 80, "image_size": 32}
     policy = ScriptedPolicy(2, random_share=0)
-    collect(tmp_path / "data", "reacher", 800, policy=policy, options=options, progress=False)
+    gather(tmp_path / "data", 800, policy=policy, options=options)
     dataset = EpisodeDataset.open(tmp_path / "data")
     assert dataset.metadata["policies"] == {"ScriptedPolicy": 10}
     nearest = [
@@ -219,95 +230,136 @@ def test_scripted_policy_goes_where_the_goals_are(tmp_path, no_processes):
     assert max(nearest) < 0.02
 
 
-def test_checkpoint_as_policy(tmp_path, no_processes):
+def test_checkpoint_as_policy(tmp_path):
     task = make_task("reacher", **OPTIONS)
     agent = build_agent("dreamer_pcp", task, size="debug")
     state = Checkpoint(agent=describe(agent), loss_module=agent.loss, format="archive")
     checkpoint = state.save(tmp_path / "checkpoint.zip")
-    dataset = collect(tmp_path / "data", "reacher", 20, policy=checkpoint, options=OPTIONS, progress=False)
+    dataset = gather(tmp_path / "data", 20, policy=checkpoint)
     assert dataset.metadata["policies"] == {str(checkpoint): 1}
     assert dataset.records["action"][1:].std() > 0
     other = {**OPTIONS, "virtual_target": 4}
     message = r"checkpoint\.zip: the agent was trained for 'reacher' with options \{.*not for"
     with pytest.raises(ValueError, match=message):
-        collect(tmp_path / "other", "reacher", 20, policy=checkpoint, options=other, progress=False)
+        gather(tmp_path / "other", 20, policy=checkpoint, options=other)
 
 
 def test_unknown_policy(tmp_path, no_collector):
     with pytest.raises(ValueError, match="unknown policy 'rnd'; there are random, scripted and checkpoint files"):
-        collect(tmp_path / "data", "reacher", 20, policy="rnd", options=OPTIONS, progress=False)
+        gather(tmp_path / "data", 20, policy="rnd")
 
 
 def test_file_that_is_no_checkpoint(tmp_path, no_collector):
     (tmp_path / "file").write_text("nothing")
     with pytest.raises(CheckpointError, match="not a checkpoint"):
-        collect(tmp_path / "data", "reacher", 20, policy=tmp_path / "file", options=OPTIONS, progress=False)
+        gather(tmp_path / "data", 20, policy=tmp_path / "file")
 
 
-class FailsSometimes(InThisProcess):
-    """A collector that breaks after its first episode."""
+class BreaksAt(EpisodePlayer):
+    """Its simulator breaks in some episodes."""
 
-    def __iter__(self):
-        yield next(super().__iter__())
-        raise RuntimeError("At least one process failed")
+    numbers: tuple[int, ...] = (1, 2)
+    error: Exception = RuntimeError("the simulation diverged")
+
+    def play(self, number):
+        if number in self.numbers:
+            raise self.error
+        return super().play(number)
 
 
-def test_failed_collector_is_replaced(tmp_path, monkeypatch):
-    monkeypatch.setattr(collect_module, "MultiSyncCollector", FailsSometimes)
-    message = r"the simulator failed \(At least one process failed\); its processes are replaced, failure 1"
+def test_failed_episode_is_left_out(tmp_path, monkeypatch):
+    whole = episodes(gather(tmp_path / "whole", 100))
+    monkeypatch.setattr(collect_module, "EpisodePlayer", BreaksAt)
+    message = r"an episode failed \(the simulation diverged\) and is left out; a new process goes on"
     with pytest.warns(RuntimeWarning, match=message):
-        dataset = collect(tmp_path / "data", "reacher", 60, options=OPTIONS, progress=False)
-    assert dataset.episode_lengths == [21, 21, 21]
+        dataset = gather(tmp_path / "data", 60)
     assert dataset.metadata["failures"] == 2
-    actions = torch.stack([episode["action"] for episode in episodes(dataset)])
-    assert len(actions.unique(dim=0)) == 3  # not the same random numbers over again
+    for episode, number in zip(episodes(dataset), (0, 3, 4), strict=True):
+        assert (episode == whole[number]).all()  # the others are as they would have been
 
 
 def test_simulator_that_fails_again_and_again(tmp_path, monkeypatch):
-    tries = []
-
-    def fail(*arguments, **options):
-        tries.append(1)
-        raise RuntimeError("no screen")
-
-    monkeypatch.setattr(collect_module, "MultiSyncCollector", fail)
-    message = "the simulator failed 4 times without an episode: no screen"
-    with pytest.warns(RuntimeWarning, match="failure 3"), pytest.raises(RuntimeError, match=message):
-        collect(tmp_path / "data", "reacher", 60, options=OPTIONS, progress=False)
-    assert len(tries) == 4
+    monkeypatch.setattr(collect_module, "EpisodePlayer", BreaksAt)
+    monkeypatch.setattr(BreaksAt, "numbers", range(100))
+    message = "4 episodes failed in a row, the last one with: the simulation diverged"
+    with pytest.warns(RuntimeWarning), pytest.raises(RuntimeError, match=message):
+        gather(tmp_path / "data", 60)
+    assert not (tmp_path / "data").exists()
 
 
-def test_killed_process_is_replaced(tmp_path, monkeypatch):
-    """With real processes: one is killed while the first episode is stored."""
-    append, collectors = EpisodeDataset.append, []
+@pytest.mark.parametrize("error", [TypeError("a bug"), NotImplementedError("no scripted policy")])
+def test_errors_that_are_not_the_simulators_are_raised_at_once(tmp_path, monkeypatch, error):
+    monkeypatch.setattr(collect_module, "EpisodePlayer", BreaksAt)
+    monkeypatch.setattr(BreaksAt, "error", error)
+    with pytest.raises(type(error), match=str(error)):
+        gather(tmp_path / "data", 60)
 
-    def remember(*arguments, **options):
-        collectors.append(MultiSyncCollector(*arguments, **options))
-        return collectors[-1]
 
-    def kill_once(dataset, records, **metadata):
-        if len(dataset.episode_lengths) == 0:
-            collectors[0].procs[0].kill()
-        append(dataset, records, **metadata)
+class Mischief(SmoothRandomPolicy):
+    """Does something to the process that it acts in, once in the life of a file."""
 
-    monkeypatch.setattr(collect_module, "MultiSyncCollector", remember)
-    monkeypatch.setattr(EpisodeDataset, "append", kill_once)
-    with pytest.warns(RuntimeWarning, match="its processes are replaced"):
-        dataset = collect(tmp_path / "data", "reacher", 600, options=OPTIONS, progress=False)
-    assert set(dataset.episode_lengths) == {21}
-    assert dataset.num_steps >= 600
+    def __init__(self, once, number):
+        super().__init__(2)
+        self.once, self.number = str(once), number
+
+    def forward(self, tensordict):
+        if not os.path.exists(self.once):
+            with open(self.once, "w") as file:
+                file.write(str(os.getpid()))
+            os.kill(os.getpid(), self.number)
+        return super().forward(tensordict)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_process_that_dies_or_hangs_is_replaced(tmp_path, number):
+    policy = Mischief(tmp_path / "done", number)
+    seen = f"has ended \\(signal {number.name}\\)" if number == signal.SIGKILL else "no sign of life for 10 seconds"
+    with pytest.warns(RuntimeWarning, match=seen):
+        dataset = gather(tmp_path / "data", 60, workers=1, policy=policy, timeout=10)
     assert dataset.metadata["failures"] == 1
-    assert len(collectors) == 2
+    assert dataset.episode_lengths == [21, 21, 21]
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "done").read_text()), 0)
+
+
+class DiesAtBirth(SmoothRandomPolicy):
+    def __reduce__(self):
+        return os._exit, (7,)
+
+
+class FailsAtBirth(SmoothRandomPolicy):
+    def __reduce__(self):
+        return int, ("no number",)
+
+
+@pytest.mark.parametrize(
+    ("policy", "error", "message"),
+    [
+        (DiesAtBirth, WorkerError, r"process \d+ has ended \(exit code 7\)"),
+        (FailsAtBirth, ValueError, "invalid literal for int.*no number"),
+    ],
+)
+def test_processes_that_fail_as_they_start_say_why(tmp_path, policy, error, message):
+    start = time.monotonic()
+    with pytest.raises(error, match=message):
+        gather(tmp_path / "data", 60, workers=2, policy=policy(2))
+    assert time.monotonic() - start < 100  # it is raised, not waited for
+
+
+def test_collecting_explores_whatever_the_context(tmp_path):
+    seen = []
+
+    class Look(SmoothRandomPolicy):
+        def forward(self, tensordict):
+            seen.append(exploration_type())
+            return super().forward(tensordict)
+
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        gather(tmp_path / "data", 20, policy=Look(2))
+    assert set(seen) == {ExplorationType.RANDOM}
 
 
 def test_foreign_index(tmp_path, no_collector):
     (tmp_path / "dataset.json").write_text('{"format": "another"}')
     with pytest.raises(DatasetError, match=r"dataset\.json: not an index of"):
-        collect(tmp_path, "reacher", 10, options=OPTIONS, progress=False)
-
-
-@pytest.mark.parametrize(("steps", "workers"), [(0, 2), (10, 0)])
-def test_less_than_one(tmp_path, no_collector, steps, workers):
-    with pytest.raises(ValueError, match=f"steps and workers must be at least 1, got {steps} and {workers}"):
-        collect(tmp_path / "data", "reacher", steps, workers=workers)
-    assert not (tmp_path / "data").exists()
+        gather(tmp_path, 10)

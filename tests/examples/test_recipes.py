@@ -11,6 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import torchrl_ocwm
+from torchrl_ocwm.agents import Position
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -89,7 +90,7 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
         "evaluate.py", f"checkpoint={files[0]}", f"include=[{output}/results.json]", *again, f"output={tmp_path}/more"
     )
     assert [line.split(" | ")[1] for line in printed.splitlines()[2:7]] == ["1", "2", "2", "1", "1"]
-    assert torchrl_ocwm.load_agent(files[0]).agent.config.goal == "position"
+    assert torchrl_ocwm.load_agent(files[0]).agent.config.behaviours["reach"].goal == Position()
 
 
 @pytest.mark.parametrize(

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
+import sys
 import warnings
 from collections import Counter
 from collections.abc import Callable, Generator
 from contextlib import closing
 from functools import partial
+from itertools import count, cycle
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from torchrl_ocwm.agents.checkpoint import load_agent
@@ -23,7 +25,10 @@ from torchrl_ocwm.data.coverage import dataset_coverage
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
 from torchrl_ocwm.data.policies import ScriptedPolicy, SmoothRandomPolicy
 from torchrl_ocwm.data.records import episode_to_records
+from torchrl_ocwm.data.seeds import episode_seed
+from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import ScriptedAction, Task, make_env, make_task
+from torchrl_ocwm.processes import Make, Worker, make_worker
 
 #: What a dataset keeps of an environment's observations.
 STORED = (
@@ -49,27 +54,29 @@ STORED = (
 
 #: Policies by name; a checkpoint is the third kind.
 POLICIES: dict[str, Callable[[int], TensorDictModuleBase]] = {"random": SmoothRandomPolicy, "scripted": ScriptedPolicy}
-#: So many collectors in a row may fail before they have given an episode.
+#: So many episodes in a row may fail.
 MAX_FAILURES = 3
 
 
 def collect(
     path: str | Path,
     environment: str,
-    steps: int,
+    settings: Collection,
     *,
-    policy: str | Path | TensorDictModuleBase = "random",
-    workers: int = 2,
-    seed: int = 0,
+    policy: TensorDictModuleBase | None = None,
     options: dict[str, Any] | None = None,
     progress: bool = True,
 ) -> EpisodeDataset:
-    """Collect whole episodes into a dataset until it holds at least ``steps`` environment steps.
+    """Collect whole episodes into a dataset until it holds at least ``settings.steps`` environment steps.
 
     A folder that holds a dataset already is continued, with other random numbers and, if you like, with another
     policy; when it has enough, nothing is collected. The process may be killed at any moment: the folder then holds
-    the whole episodes written so far. When a simulator fails, the worker processes are replaced and the episodes that
-    they were at are dropped.
+    the whole episodes written so far. An episode whose simulator fails, or whose process dies or hangs, is dropped,
+    and the process replaced.
+
+    The random numbers of an episode come from the seed and the number of the episode in the dataset. So the same
+    settings give the same episodes in the same order, with any number of processes, and whether or not the collection
+    was interrupted.
 
     The index of the dataset counts the episodes of each policy (``policies``) and the failures (``failures``), and
     says how often objects move and what part of the workspace they visit (``coverage``, see
@@ -78,12 +85,8 @@ def collect(
     Args:
         path: Folder of the dataset.
         environment: Name of the environment (:data:`~torchrl_ocwm.envs.ENVIRONMENTS`).
-        steps: Environment steps to reach.
-        policy: ``"random"`` for smooth random actions, ``"scripted"`` for scripted ones with noise
-            (:class:`~torchrl_ocwm.data.ScriptedPolicy`), a checkpoint of an agent, which then explores, or a module
-            that writes ``action``.
-        workers: Processes that step one environment each.
-        seed: Seeds environments and actions.
+        settings: How much, by whom and how.
+        policy: A module that writes ``action``, in place of ``settings.policy``.
         options: Passed to the environment.
         progress: Show a progress bar with the rate.
 
@@ -92,36 +95,32 @@ def collect(
 
     Raises:
         DatasetError: if the folder holds a dataset of another environment or other options, or cannot be written.
-        ValueError: for fewer than one step or worker, an unknown policy, or a checkpoint of another task's agent.
+        ValueError: for an unknown policy, or a checkpoint of another task's agent.
         CheckpointError: for a file that is no checkpoint of an agent.
-        RuntimeError: if the simulator fails again and again.
+        WorkerError: if a process ends before it has begun.
+        RuntimeError: if one episode after the other fails.
     """
-    if steps < 1 or workers < 1:
-        raise ValueError(f"steps and workers must be at least 1, got {steps} and {workers}")
     options = options or {}
     task = make_task(environment, **options)
     source = {"environment": environment, "options": options, "task": task.to_dict()}
-    name, module = make_policy(policy, task)
+    name, module = make_policy(settings.policy if policy is None else policy, task)
     dataset = _open_if_there(Path(path), source)
-    if dataset is not None and dataset.num_steps >= steps:
+    if dataset is not None and dataset.num_steps >= settings.steps:
         return _with_coverage(dataset, task)
     done = dataset.num_steps if dataset is not None else 0
 
-    def make_collector(attempt: int) -> MultiSyncCollector:
-        return _make_collector(environment, options, module, workers, seed + done + attempt)
-
-    bar = tqdm(total=steps, initial=done, unit="step", desc=f"collect {environment}", disable=not progress)
-    with bar, closing(_whole_episodes(make_collector)) as episodes:
-        for episode, failures in episodes:
-            records = episode_to_records(episode).select(*STORED)
+    make_player = partial(EpisodePlayer, partial(make_env, environment, **options), module, settings.seed)
+    played = play_in_order(make_player, settings, first=_next_number(dataset))
+    bar = tqdm(total=settings.steps, initial=done, unit="step", desc=f"collect {environment}", disable=not progress)
+    with bar, closing(played) as episodes:
+        for records, failures in episodes:
             if dataset is None:
                 dataset = EpisodeDataset.create(path, example=records[0], metadata=source)
             dataset.append(records, **_count(dataset, name, failures), coverage=None)
             bar.update(len(records) - 1)
-            if dataset.num_steps >= steps:
+            if dataset.num_steps >= settings.steps:
                 break
-    if dataset is None:
-        raise DatasetError(f"{path}: the collector ended before the first episode was complete")
+    assert dataset is not None
     dataset.trim()
     return _with_coverage(dataset, task)
 
@@ -148,55 +147,97 @@ def make_policy(policy: str | Path | TensorDictModuleBase, task: Task) -> tuple[
     return str(policy), loaded
 
 
-def _make_collector(
-    environment: str, options: dict[str, Any], policy: TensorDictModuleBase, workers: int, seed: int
-) -> MultiSyncCollector:
-    torch.manual_seed(seed)
-    # The collector resets its environments before it can be seeded, so they bring their first seeds along.
-    first_seeds = torch.randint(2**31, (workers,)).tolist()
-    make = _scripted_env if isinstance(policy, ScriptedPolicy) else make_env
-    collector = MultiSyncCollector(
-        [partial(make, environment, seed=first_seed, **options) for first_seed in first_seeds],
-        policy,
-        frames_per_batch=workers * 100,
-        total_frames=-1,
-        trajs_per_batch=1,
-        traj_format="cat",
-        use_buffers=False,
-    )
-    collector.set_seed(seed)
-    return collector
+class EpisodePlayer:
+    """Plays whole episodes, each with random numbers of its own; actions are explored, whatever the context.
 
+    Args:
+        make: Makes the environment.
+        policy: Acts in it.
+        seed: Seed of the collection.
+        alive: Called after each step.
+    """
 
-def _scripted_env(environment: str, **options: Any) -> EnvBase:
-    return make_env(environment, **options).append_transform(ScriptedAction())
+    def __init__(
+        self, make: Callable[[], EnvBase], policy: TensorDictModuleBase, seed: int, alive: Callable[[], None]
+    ) -> None:
+        self.env, self.policy, self.seed, self.alive = make(), policy, seed, alive
+        if isinstance(policy, ScriptedPolicy):
+            self.env = self.env.append_transform(ScriptedAction())
 
-
-def _whole_episodes(
-    make_collector: Callable[[int], MultiSyncCollector],
-) -> Generator[tuple[TensorDictBase, int], None, None]:
-    """Episodes ``[T]``, each with the number of failures since the one before; a collector that fails is replaced."""
-    attempt = failures = 0
-    while True:
-        collector = None
-        try:
-            collector = make_collector(attempt)
-            for batch in collector:
-                yield batch.reshape(-1), failures
-                failures = 0
-            return
-        except RuntimeError as error:  # what the collector raises for a process that died
-            attempt, failures = attempt + 1, failures + 1
-            if failures > MAX_FAILURES:
-                raise RuntimeError(f"the simulator failed {failures} times without an episode: {error}") from error
-            warnings.warn(
-                f"the simulator failed ({error}); its processes are replaced, failure {attempt} of this run",
-                RuntimeWarning,
-                stacklevel=2,
+    @torch.no_grad()
+    def play(self, number: int) -> TensorDictBase:
+        """The records ``[T + 1]`` of an episode."""
+        seed = episode_seed("collect", self.seed, number)
+        with torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
+            torch.manual_seed(seed)
+            episode = self.env.rollout(
+                sys.maxsize,
+                self.policy,
+                callback=lambda *_: self.alive(),
+                auto_reset=False,
+                break_when_any_done=True,
+                tensordict=self.env.reset(seed=seed),
             )
-        finally:
-            if collector is not None:
-                collector.shutdown(raise_on_error=False)
+        return episode_to_records(episode).select(*STORED)
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+
+def play_in_order(
+    make_player: Make, settings: Collection, *, first: int
+) -> Generator[tuple[TensorDictBase, int], None, None]:
+    """Episodes in the order of their numbers, each with the number of failures since the one before.
+
+    Args:
+        make_player: Makes an :class:`EpisodePlayer`.
+        settings: Workers and timeout.
+        first: Number of the first episode.
+
+    Raises:
+        WorkerError: if a process ends before it has begun.
+        RuntimeError: if one episode after the other fails.
+    """
+    begin = partial(make_worker, make_player, process=settings.workers > 0, timeout=settings.timeout)
+    numbers, failures = count(first), 0
+    players: list[Worker] = []
+    try:
+        for _ in range(max(settings.workers, 1)):
+            players.append(begin())
+        for player in players:
+            player.ready()
+            player.request("play", next(numbers))
+        for turn in cycle(range(len(players))):
+            episode = None
+            try:
+                episode = players[turn].answer()
+            except RuntimeError as error:  # of the simulator, or of a process that died or hangs
+                failures += 1
+                _check_failures(failures, error)
+                players[turn].close()
+                players[turn] = begin()
+                players[turn].ready()
+            players[turn].request("play", next(numbers))
+            if episode is not None:
+                yield episode, failures
+                failures = 0
+    finally:
+        for player in players:
+            player.close()
+
+
+def _check_failures(failures: int, error: RuntimeError) -> None:
+    if isinstance(error, NotImplementedError):
+        raise error
+    if failures > MAX_FAILURES:
+        raise RuntimeError(f"{failures} episodes failed in a row, the last one with: {error}") from error
+    warnings.warn(f"an episode failed ({error}) and is left out; a new process goes on", RuntimeWarning, stacklevel=2)
+
+
+def _next_number(dataset: EpisodeDataset | None) -> int:
+    """Episodes that were played so far, those that failed included."""
+    return 0 if dataset is None else len(dataset.episode_lengths) + dataset.metadata.get("failures", 0)
 
 
 def _count(dataset: EpisodeDataset, policy: str, failures: int) -> dict[str, Any]:

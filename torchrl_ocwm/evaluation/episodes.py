@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -10,18 +11,61 @@ import gymnasium
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from tqdm import tqdm
 
 from torchrl_ocwm.data.records import episode_to_records
+from torchrl_ocwm.data.seeds import episode_seed
 from torchrl_ocwm.envs import ENVIRONMENTS, Task, make_env
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
+from torchrl_ocwm.evaluation.randomness import EpisodeRandomness
 from torchrl_ocwm.evaluation.scores import normalized_score
+from torchrl_ocwm.processes import Worker, make_worker
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 _KEPT = ("object_position", "object_position_true", "reward")
 _SEEN = ("pixels", "masks", "proprio", "object_position", "object_visible", "goal_position")
+
+
+class SteppedEnvs:
+    """Environments that are stepped one after the other, made when they are first needed.
+
+    Args:
+        make: Makes one.
+        alive: Called after each step.
+    """
+
+    def __init__(self, make: Callable[[], EnvBase], alive: Callable[[], None]) -> None:
+        self.make, self.alive = make, alive
+        self.envs: list[EnvBase] = []
+
+    def reset(self, starts: list[dict[str, Any]]) -> TensorDictBase:
+        """Reset as many environments as there are arguments; the first observations ``[E]``."""
+        while len(self.envs) < len(starts):
+            self.envs.append(self.make())
+            self.alive()
+        return self._all(lambda index: self.envs[index].reset(**starts[index]), len(starts))
+
+    def step(self, actions: Tensor) -> TensorDictBase:
+        """Do the actions ``[E, A]``; what comes next ``[E]``."""
+
+        def one(index: int) -> TensorDictBase:
+            return self.envs[index].step(TensorDict({"action": actions[index]}))["next"]
+
+        return self._all(one, len(actions))
+
+    def _all(self, call: Callable[[int], TensorDictBase], number: int) -> TensorDictBase:
+        results = []
+        for index in range(number):
+            results.append(call(index))
+            self.alive()
+        return torch.stack(results)
+
+    def close(self) -> None:
+        """Close the environments."""
+        while self.envs:
+            self.envs.pop().close()
 
 
 class EvaluationEnvs:
@@ -32,15 +76,25 @@ class EvaluationEnvs:
         episode_steps: Steps per episode.
         workers: Processes; 0 steps all environments in this process.
         envs: Environments per process.
+        timeout: Seconds without a step after which a process counts as hanging.
 
     Close it, or use it in a ``with`` block.
     """
 
-    def __init__(self, task: Task, *, episode_steps: int, workers: int = 2, envs: int = 10) -> None:
-        make = partial(make_env, task.name, horizon=episode_steps, **task.options)
-        serial = partial(SerialEnv, envs, make)
-        self.task, self.episode_steps, self.shape = task, episode_steps, (max(workers, 1), envs)
-        self.env: EnvBase = ParallelEnv(workers, serial, mp_start_method="spawn") if workers else SerialEnv(1, serial)
+    def __init__(
+        self, task: Task, *, episode_steps: int, workers: int = 2, envs: int = 10, timeout: float = 120.0
+    ) -> None:
+        self.task, self.episode_steps, self.envs = task, episode_steps, envs
+        make = partial(SteppedEnvs, partial(make_env, task.name, horizon=episode_steps, **task.options))
+        self._workers: list[Worker] = []
+        try:
+            for _ in range(max(workers, 1)):
+                self._workers.append(make_worker(make, process=workers > 0, timeout=timeout))
+            for worker in self._workers:
+                worker.ready()
+        except BaseException:
+            self.close()
+            raise
 
     def run(
         self,
@@ -49,18 +103,24 @@ class EvaluationEnvs:
         *,
         images: Tensor | None = None,
         seed: int = 0,
+        numbers: Tensor | None = None,
         keep: tuple[Any, ...] = (),
-        inspect: Callable[[TensorDictBase], dict[str, Tensor]] | None = None,
+        inspect: Callable[[TensorDictBase], dict[str, Any]] | None = None,
         progress: bool = False,
     ) -> TensorDict:
         """One episode for each goal, acting without exploration.
+
+        The start of an episode, and what the policy draws in it (states of the world model, random actions), come from
+        the seed and the goal's number alone. So the episodes do not depend on how many environments there are, up to
+        the rounding of sums, and none of them starts like one that was collected.
 
         Args:
             policy: The policy.
             goals: ``[N, D]`` metres; the environments judge by them.
             images: ``[N, 3, H, W]`` or ``[N, F, 3, H, W]`` uint8; given to the policy instead of the positions
                 (:class:`~torchrl_ocwm.modules.GivenGoals`).
-            seed: Seeds the environments.
+            seed: Seeds the episodes, together with the goals' numbers.
+            numbers: ``[N]`` int64, the goals' numbers; 0, 1, 2, … by default.
             keep: More keys to keep of each step.
             inspect: Called with each step's tensordict ``[E]`` after the policy; what it returns is kept too.
             progress: Show a progress bar.
@@ -68,17 +128,19 @@ class EvaluationEnvs:
         Returns:
             ``[N, T]`` with ``object_position_true`` and ``object_position`` ``[O, D]``, ``reward`` and what else was
             asked for, after each step, and ``goal_position``.
+
+        Raises:
+            ValueError: for goals outside the workspace.
+            WorkerError: if a process ends or hangs.
         """
         goals = self.task.workspace.check(goals)
-        size = self.shape[0] * self.shape[1]
-        self.env.set_seed(seed)
+        numbers = torch.arange(len(goals)) if numbers is None else numbers
         batches = []
         with tqdm(total=len(goals), unit="goal", desc="evaluate", disable=not progress) as bar:
-            for chunk in torch.arange(len(goals)).split(size):
-                # The last chunk is filled up with copies of its last goal.
-                full = torch.cat([chunk, chunk[-1:].expand(size - len(chunk))])
-                seen = None if images is None else images[full]
-                batches.append(self._episodes(policy, goals[full], seen, keep, inspect)[: len(chunk)])
+            for chunk in torch.arange(len(goals)).split(self.envs * len(self._workers)):
+                seeds = [episode_seed("evaluate", seed, number) for number in numbers[chunk].tolist()]
+                seen = None if images is None else images[chunk]
+                batches.append(self._episodes(policy, goals[chunk], seeds, seen, keep, inspect))
                 bar.update(len(chunk))
         return TensorDict.cat(batches)
 
@@ -87,31 +149,43 @@ class EvaluationEnvs:
         self,
         policy: Policy,
         goals: Tensor,
+        seeds: list[int],
         images: Tensor | None,
         keep: tuple[Any, ...],
-        inspect: Callable[[TensorDictBase], dict[str, Tensor]] | None,
+        inspect: Callable[[TensorDictBase], dict[str, Any]] | None,
     ) -> TensorDict:
-        options = [{"options": {"goal_position": goal.numpy()}} for goal in goals]
-        per_worker = [{"list_of_kwargs": options[i : i + self.shape[1]]} for i in range(0, len(goals), self.shape[1])]
-        tensordict = self.env.reset(list_of_kwargs=per_worker)
+        starts = [
+            {"seed": seed, "options": {"goal_position": goal.numpy()}} for seed, goal in zip(seeds, goals, strict=True)
+        ]
+        tensordict = self._together("reset", starts)
         if images is not None:
-            tensordict["goal"] = TensorDict({"pixels": images.unflatten(0, self.shape)}, self.shape)
+            tensordict["goal"] = TensorDict({"pixels": images}, [len(goals)])
         steps = []
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            for _ in range(self.episode_steps):
-                tensordict = self.env.step(policy(tensordict))
-                kept = tensordict["next"].select(*_KEPT, *keep).clone()
-                if inspect is not None:
-                    kept.update(inspect(tensordict))
-                steps.append(kept.reshape(-1))
-                tensordict = step_mdp(tensordict, keep_other=True, exclude_action=False)
+        randomness = EpisodeRandomness(seeds)
+        for _ in range(self.episode_steps):
+            with set_exploration_type(ExplorationType.DETERMINISTIC), randomness:
+                tensordict = policy(tensordict)
+            tensordict["next"] = self._together("step", tensordict["action"])
+            kept = tensordict["next"].select(*_KEPT, *keep).clone()
+            if inspect is not None:
+                kept.update(inspect(tensordict))
+            steps.append(kept)
+            tensordict = step_mdp(tensordict, keep_other=True, exclude_action=False)
         episodes = TensorDict.stack(steps, 1)
         return episodes.set("goal_position", goals.unsqueeze(1).expand(-1, self.episode_steps, -1).clone())
 
+    def _together(self, method: str, arguments: Any) -> TensorDictBase:
+        """Call a method of the environments of every process at the same time, each with its part of the arguments."""
+        parts = [arguments[start : start + self.envs] for start in range(0, len(arguments), self.envs)]
+        at_work = self._workers[: len(parts)]
+        for worker, part in zip(at_work, parts, strict=True):
+            worker.request(method, part)
+        return torch.cat([worker.answer() for worker in at_work])
+
     def close(self) -> None:
-        """Stop the processes."""
-        if not self.env.is_closed:
-            self.env.close()
+        """Close the environments and end the processes."""
+        for worker in self._workers:
+            worker.close()
 
     def __enter__(self) -> EvaluationEnvs:
         return self
@@ -141,12 +215,10 @@ def goal_images(task: Task, goals: Tensor) -> Tensor:
     Returns:
         ``[N, 3, H, W]`` uint8.
     """
-    env = gymnasium.make(ENVIRONMENTS[task.name].id, **task.options)
-    env.reset(seed=0)
-    scene: Any = env.unwrapped
-    images = [torch.from_numpy(scene.goal_observation(goal)["pixels"]) for goal in goals.numpy()]
-    env.close()
-    return torch.stack(images)
+    with closing(gymnasium.make(ENVIRONMENTS[task.name].id, **task.options)) as env:
+        env.reset(seed=0)
+        scene: Any = env.unwrapped
+        return torch.stack([torch.from_numpy(scene.goal_observation(goal)["pixels"]) for goal in goals.numpy()])
 
 
 def measure(episodes: TensorDictBase, *, object_index: int = 0) -> dict[str, Tensor]:

@@ -10,16 +10,19 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_ocwm.agents.agent import Agent
+from torchrl_ocwm.data.seeds import episode_seed
+from torchrl_ocwm.evaluation.randomness import EpisodeRandomness
 
 
 @torch.no_grad()
-def imagined_rollout(agent: Agent, latent: TensorDictBase, steps: int) -> TensorDictBase:
+def imagined_rollout(agent: Agent, latent: TensorDictBase, steps: int, *, seed: int = 0) -> TensorDictBase:
     """What an agent imagines from a latent when it acts on its own predictions, without exploration.
 
     Args:
         agent: The agent.
         latent: ``[N]`` with state, belief and, if the agent is conditioned on one, goal.
         steps: Steps to imagine.
+        seed: Seeds what the world model draws, together with the number of the row.
 
     Returns:
         ``[N, steps]`` with ``latent`` and ``action``; the first latent is the given one.
@@ -27,7 +30,8 @@ def imagined_rollout(agent: Agent, latent: TensorDictBase, steps: int) -> Tensor
     latent = latent.select("state", "belief", "goal", strict=False)
     start = TensorDict({"latent": latent}, latent.batch_size)
     actor: Callable[[TensorDictBase], TensorDictBase] = agent.actor
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    randomness = EpisodeRandomness([episode_seed("imagine", seed, number) for number in range(len(latent))])
+    with set_exploration_type(ExplorationType.DETERMINISTIC), randomness:
         return agent.imagination.rollout(
             steps, actor, auto_reset=False, tensordict=start, break_when_any_done=False
         ).select("latent", "action")
@@ -35,7 +39,7 @@ def imagined_rollout(agent: Agent, latent: TensorDictBase, steps: int) -> Tensor
 
 @torch.no_grad()
 def imagined_distance(
-    agent: Agent, latent: TensorDictBase, goals: Tensor, steps: int, *, object_index: int = 0
+    agent: Agent, latent: TensorDictBase, goals: Tensor, steps: int, *, object_index: int = 0, seed: int = 0
 ) -> Tensor:
     """How far from its goal an agent expects the object to be in the end.
 
@@ -48,10 +52,11 @@ def imagined_distance(
         goals: ``[N, D]`` metres.
         steps: Steps to imagine.
         object_index: Which object.
+        seed: As for :func:`imagined_rollout`.
 
     Returns:
         ``[N]`` metres, of the position that the world model decodes from the last latent.
     """
-    last = imagined_rollout(agent, latent, steps + 1)[:, -1].select("latent")
+    last = imagined_rollout(agent, latent, steps + 1, seed=seed)[:, -1].select("latent")
     decoded = agent.model.object_position()(last)["object_units"].unflatten(-1, (-1, agent.model.units.dim))
     return torch.linalg.vector_norm(agent.model.units.to_metres(decoded[:, object_index]) - goals, dim=-1)

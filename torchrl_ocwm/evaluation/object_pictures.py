@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
 import torch
+from matplotlib import pyplot as plt
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm.evaluation.goal_latents import cosines, distances
 from torchrl_ocwm.evaluation.objects import decode_objects
 from torchrl_ocwm.evaluation.open_loop import open_loop_latents, posterior
+from torchrl_ocwm.evaluation.plots import save_figure
 from torchrl_ocwm.evaluation.videos import grey, tile, to_uint8, write_video
 from torchrl_ocwm.modules import ObjectWorldModel
 from torchrl_ocwm.objectives.focus import instance_masks
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 _STYLES = {"filtered": "C0", "imagined": "C3", "unmoved": "0.5"}
 
@@ -94,7 +92,7 @@ def draw_objects(path: str | Path, rows: dict[str, Tensor], context: int, *, fra
             axis.set(xticks=[], yticks=[])
     for axis, time in zip(axes[0], times, strict=True):
         axis.set_title("last seen" if time < context else f"step {time - context + 1}")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def draw_errors(path: str | Path, errors: dict[str, dict[str, Tensor]], names: Sequence[str]) -> None:
@@ -117,7 +115,7 @@ def draw_errors(path: str | Path, errors: dict[str, dict[str, Tensor]], names: S
             axis.set_ylim(bottom=0)
             axis.grid(alpha=0.3)
             axis.legend()
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _curve(axis: plt.Axes, curves: dict[str, Tensor], key: str, view: str) -> None:
@@ -149,10 +147,4 @@ def draw_goal_latents(path: str | Path, pairs: dict[str, tuple[Tensor, Tensor]],
         axis.grid(alpha=0.3)
     axes[0, 0].set_ylabel("cosine")
     axes[0, 0].legend(markerscale=2)
-    _save(figure, path)
-
-
-def _save(figure: plt.Figure, path: str | Path) -> None:
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120, bbox_inches="tight")
-    plt.close(figure)
+    save_figure(figure, path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import csv
+import warnings
 from pathlib import Path
 from textwrap import fill
 
@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchrl_ocwm.envs.workspace import Workspace
+from torchrl_ocwm.evaluation.output import writing
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -23,7 +24,7 @@ def heatmap(path: str | Path, scores: dict[str, Tensor], workspace: Workspace, *
 
     Args:
         path: PNG file to write.
-        scores: Name → ``[size * size]`` scores in [0, 1], in the order of :meth:`Workspace.grid`.
+        scores: Name → ``[size * size]`` scores in [0, 1], in the order of :meth:`Workspace.grid`. NaN is left blank.
         workspace: The workspace that the grid covers.
         title: Written above.
     """
@@ -33,14 +34,13 @@ def heatmap(path: str | Path, scores: dict[str, Tensor], workspace: Workspace, *
         edges = 100 * workspace.grid_edges(size)
         x, y = edges[..., 0].numpy(), edges[..., -1].numpy()
         mesh = axis.pcolormesh(x, y, values.reshape(size, size).numpy(), vmin=0, vmax=1, cmap="viridis")
-        axis.set_title(fill(f"{name}: {values.mean():.2f}", 28))
+        axis.set_title(fill(f"{name}: {values.nanmean():.2f}", 28))
         axis.set_aspect("equal")
         axis.set_xlabel("cm")
     figure.colorbar(mesh, ax=axes, label="score", shrink=0.8)
     if title:
         figure.suptitle(title)
-    figure.savefig(path, dpi=120, bbox_inches="tight")
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict[str, str]) -> None:
@@ -64,8 +64,20 @@ def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict
         axis.set_ylabel(metrics[metric])
         axis.grid(alpha=0.3)
         axis.legend(fontsize="small")
-    figure.savefig(path, dpi=120, bbox_inches="tight")
-    plt.close(figure)
+    save_figure(figure, path)
+
+
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a picture, and forget it.
+
+    Raises:
+        OutputError: if it cannot be written.
+    """
+    try:
+        with writing(path) as file:
+            figure.savefig(file, dpi=120, bbox_inches="tight")
+    finally:
+        plt.close(figure)
 
 
 def _panels(number: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
@@ -97,12 +109,23 @@ def _curves(folders: list[Path], metric: str) -> list[tuple[np.ndarray, np.ndarr
 def read_scalar(folder: Path, metric: str) -> tuple[np.ndarray, np.ndarray] | None:
     """Steps and values that TorchRL's CSV logger wrote for a metric, or ``None`` if there are none.
 
-    A resumed run may have logged a step twice; the later value counts.
+    A resumed run may have logged a step twice; the later value counts. A line that was cut, as by a full disk or a
+    power cut, is left out with a warning.
     """
     files = list(folder.rglob(f"scalars/{metric}.csv"))
     if not files:
         return None
-    with files[0].open() as file:
-        values = {int(step): float(value) for step, value in csv.reader(file)}
+    values, cut = {}, 0
+    with files[0].open(newline="") as file:
+        for line in file:
+            try:
+                step, value = line.split(",")
+                values[int(step)] = float(value)
+            except ValueError:
+                cut += 1
+    if cut:
+        warnings.warn(f"{files[0]}: {cut} line(s) are not a step and a value; left out", RuntimeWarning, stacklevel=2)
+    if not values:
+        return None
     order = sorted(values)
     return np.array(order), np.array([values[step] for step in order])

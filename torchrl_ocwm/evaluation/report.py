@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_ocwm.evaluation.scores import mean_and_error
+from torchrl_ocwm.evaluation.output import writing
+from torchrl_ocwm.evaluation.scores import mean_and_error, score_is_undefined
 
 #: Metric → column of the table and digits after the point.
 COLUMNS = {
@@ -23,6 +24,23 @@ COLUMNS = {
     "entity_error": ("entity reconstruction error, m", 3),
     "goal_error": ("goal reconstruction error, m", 3),
 }
+
+
+@dataclass
+class Row:
+    """The seeds of one agent.
+
+    Args:
+        kind: What tells the agent from others of its name, such as its settings in full.
+        seeds: What was measured for each seed: metric → ``[N]`` values, one per goal, NaN where it is not defined.
+        sources: Where each seed comes from.
+        runs: What tells one seed from another, whatever its file is called.
+    """
+
+    kind: str
+    seeds: list[dict[str, Tensor]] = field(default_factory=list)
+    sources: list[str] = field(default_factory=list)
+    runs: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -45,8 +63,7 @@ class Report:
 
     goals: Tensor
     settings: dict[str, Any] = field(default_factory=dict)
-    seeds: dict[str, list[dict[str, Tensor]]] = field(default_factory=dict)
-    sources: dict[str, list[str]] = field(default_factory=dict)
+    rows: dict[str, Row] = field(default_factory=dict)
 
     @classmethod
     def load(cls, file: str | Path) -> Report:
@@ -59,9 +76,11 @@ class Report:
             values = json.loads(Path(file).read_text())
             report = cls(torch.tensor(values["goals"]), values["settings"])
             for agent, row in values["agents"].items():
-                for source, seed in zip(row["sources"], row["per_goal"], strict=True):
-                    report.add(agent, {name: torch.tensor(one) for name, one in seed.items()}, source=source)
-        except (OSError, KeyError, TypeError, ValueError) as error:
+                runs = row.get("runs", row["sources"])  # older files know runs by their sources only
+                report.rows[agent] = Row(
+                    row.get("kind", agent), [_tensors(seed) for seed in row["per_goal"]], row["sources"], runs
+                )
+        except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{file}: not the results.json of an evaluation ({error!r})") from error
         return report
 
@@ -69,73 +88,144 @@ class Report:
         """Add the rows of another report.
 
         Raises:
-            ValueError: if it was made with other goals or settings.
+            ValueError: if it was made with other goals or settings, or holds a run that is here already.
         """
         if self.goals.shape != other.goals.shape or not torch.allclose(self.goals, other.goals):
             raise ValueError("these results were made with other goals")
         if self.settings != other.settings:
             raise ValueError(f"these results were made with other settings: {other.settings}, here {self.settings}")
-        for agent, seeds in other.seeds.items():
-            self.seeds.setdefault(agent, []).extend(seeds)
-            self.sources.setdefault(agent, []).extend(other.sources[agent])
+        for agent, row in other.rows.items():
+            for metrics, source, run in zip(row.seeds, row.sources, row.runs, strict=True):
+                self.add(agent, metrics, source=source, run=run, kind=row.kind)
 
-    def add(self, agent: str, metrics: dict[str, Tensor], *, source: str) -> None:
-        """Add one seed of an agent: metric → ``[N]`` values, one per goal."""
-        self.seeds.setdefault(agent, []).append(metrics)
-        self.sources.setdefault(agent, []).append(source)
+    def add(
+        self,
+        agent: str,
+        metrics: dict[str, Tensor],
+        *,
+        source: str,
+        run: str | None = None,
+        kind: str | None = None,
+    ) -> None:
+        """Add one seed of an agent.
+
+        An agent of another kind than that of its name gets a row of its own, with a number behind the name.
+
+        Args:
+            agent: Its name.
+            metrics: Metric → ``[N]`` values, one per goal, NaN where it is not defined.
+            source: Where it comes from, such as the path of a checkpoint.
+            run: What tells it from other seeds, such as the contents of the checkpoint; the source by default.
+            kind: What tells the agent from others of its name; nothing by default.
+
+        Raises:
+            ValueError: if the row has that run already.
+        """
+        kind, run = agent if kind is None else kind, source if run is None else run
+        row = self.rows.setdefault(self._row_name(agent, kind), Row(kind))
+        if run in row.runs:
+            raise ValueError(
+                f"{source}: the same run as {row.sources[row.runs.index(run)]}, which counts as a seed of {agent} "
+                "already; leave one of them out"
+            )
+        row.seeds.append(metrics)
+        row.sources.append(source)
+        row.runs.append(run)
+
+    def _row_name(self, agent: str, kind: str) -> str:
+        names = [agent, *(f"{agent} #{number}" for number in range(2, len(self.rows) + 2))]
+        return next(name for name in names if name not in self.rows or self.rows[name].kind == kind)
 
     def per_goal(self, metric: str) -> dict[str, Tensor]:
-        """Agent → ``[N]``, the mean over its seeds."""
-        return {agent: torch.stack([one[metric] for one in seeds]).mean(0) for agent, seeds in self.seeds.items()}
+        """Agent → ``[N]``, the mean over its seeds; NaN where it is not defined."""
+        return {agent: torch.stack([one[metric] for one in row.seeds]).mean(0) for agent, row in self.rows.items()}
 
     def summary(self, agent: str, metric: str) -> tuple[float, float | None] | None:
-        """Mean over goals and seeds and its standard error over seeds; ``None`` if it was not measured."""
-        seeds = [one[metric].mean() for one in self.seeds[agent] if metric in one]
-        return mean_and_error(torch.stack(seeds)) if seeds else None
+        """Mean over goals and seeds and its standard error over seeds; ``None`` if it was not measured.
+
+        Goals for which the metric is not defined are left out.
+        """
+        means = [one[metric].nanmean() for one in self.rows[agent].seeds if metric in one]
+        seeds = torch.stack(means) if means else torch.empty(0)
+        return mean_and_error(seeds) if len(seeds) and not seeds.isnan().any() else None
 
     def markdown(self) -> str:
         """A table, one row per agent; a dash where there is nothing to measure."""
-        columns = [name for name in COLUMNS if any(self.summary(agent, name) for agent in self.seeds)]
+        columns = [name for name in COLUMNS if any(self.summary(agent, name) for agent in self.rows)]
         lines = [
             "| " + " | ".join(["agent", "seeds", *(COLUMNS[name][0] for name in columns)]) + " |",
             "|" + "---|" * (2 + len(columns)),
         ]
-        for agent, seeds in self.seeds.items():
+        for agent, row in self.rows.items():
             cells = [_cell(self.summary(agent, name), COLUMNS[name][1]) for name in columns]
-            lines.append("| " + " | ".join([agent, str(len(seeds)), *cells]) + " |")
+            lines.append("| " + " | ".join([agent, str(len(row.seeds)), *cells]) + " |")
+        at_start = int(score_is_undefined(self.goals).sum())
+        if at_start:
+            lines += ["", f"Without a score, as they lie at the start: {at_start} of {len(self.goals)} goals."]
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """All numbers, ready for JSON."""
+        """All numbers, ready for :func:`to_json`."""
         agents: dict[str, Any] = {}
-        for agent, seeds in self.seeds.items():
+        for agent, row in self.rows.items():
             summaries = {name: self.summary(agent, name) for name in COLUMNS}
             agents[agent] = {
-                "sources": self.sources[agent],
+                "kind": row.kind,
+                "sources": row.sources,
+                "runs": row.runs,
                 "metrics": {
                     name: None if pair is None else {"mean": pair[0], "standard_error": pair[1]}
                     for name, pair in summaries.items()
                 },
-                "per_goal": [{name: values.tolist() for name, values in one.items()} for one in seeds],
+                "per_goal": row.seeds,
             }
-        return {"settings": self.settings, "goals": self.goals.tolist(), "agents": agents}
+        return {"settings": self.settings, "goals": self.goals, "agents": agents}
 
     def save(self, folder: str | Path) -> None:
-        """Write ``results.json`` and ``results.md``, each in one step."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        _replace(folder / "results.json", json.dumps(self.to_dict(), indent=1) + "\n")
-        _replace(folder / "results.md", self.markdown() + "\n")
+        """Write ``results.json`` and ``results.md``, each in one step.
+
+        Raises:
+            OutputError: if they cannot be written; the files of before are then as they were.
+        """
+        with writing(Path(folder) / "results.json") as file:
+            file.write_text(to_json(self.to_dict()))
+        with writing(Path(folder) / "results.md") as file:
+            file.write_text(self.markdown() + "\n")
+
+
+def to_json(values: Any) -> str:
+    r"""JSON of values with tensors among them. JSON has no NaN and no infinity, so that they become ``null``.
+
+    Examples:
+        >>> to_json({"score": torch.tensor([0.5, float("nan")])})
+        '{\n "score": [\n  0.5,\n  null\n ]\n}\n'
+    """
+    return json.dumps(_plain(values), indent=1, allow_nan=False) + "\n"
+
+
+def _plain(values: Any) -> Any:
+    if isinstance(values, dict):
+        return {name: _plain(value) for name, value in values.items()}
+    if isinstance(values, Tensor):
+        return _plain(values.tolist())
+    if isinstance(values, (list, tuple)):
+        return [_plain(value) for value in values]
+    return None if isinstance(values, float) and not math.isfinite(values) else values
+
+
+def _tensors(seed: dict[str, list[float | None]]) -> dict[str, Tensor]:
+    return {
+        name: torch.tensor([math.nan if value is None else value for value in values]) for name, values in seed.items()
+    }
 
 
 def _cell(pair: tuple[float, float | None] | None, digits: int) -> str:
+    """Mean ± error, with more digits where the error would be shown as zero."""
     if pair is None:
         return "–"
     mean, error = pair
-    return f"{mean:.{digits}f}" if error is None else f"{mean:.{digits}f} ± {error:.{digits}f}"
-
-
-def _replace(file: Path, text: str) -> None:
-    draft = file.with_name(f".{file.name}.draft")
-    draft.write_text(text)
-    os.replace(draft, file)
+    if error is None:
+        return f"{mean:.{digits}f}"
+    if 0 < error < 0.5 * 10**-digits:
+        digits = min(-math.floor(math.log10(error)), digits + 3)
+    return f"{mean:.{digits}f} ± {error:.{digits}f}"

@@ -5,13 +5,28 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+_AT_START = 1e-3  # metres
+
+
+def score_is_undefined(goal: Tensor) -> Tensor:
+    """Whether goals ``[..., D]`` lie within a millimetre of the start, so that there is no way to normalise by.
+
+    Examples:
+        >>> score_is_undefined(torch.tensor([[0.0, 0.2], [0.0, 0.0]]))
+        tensor([False,  True])
+    """
+    return torch.linalg.vector_norm(goal, dim=-1) < _AT_START
+
 
 def normalized_score(position: Tensor, goal: Tensor) -> Tensor:
     """exp(−‖p − p_g‖ / ‖p_g‖): 1 at the goal, 1/e for staying at the start (paper, equation 2 and appendix).
 
     Args:
         position: ``[..., D]`` metres from the start position.
-        goal: ``[..., D]`` metres from the start position, not the start itself.
+        goal: ``[..., D]`` metres from the start position. A goal at the start has no score: it is NaN.
+
+    Returns:
+        ``[...]`` in (0, 1], or NaN.
 
     Examples:
         >>> goal = torch.tensor([0.0, 0.2])
@@ -19,7 +34,8 @@ def normalized_score(position: Tensor, goal: Tensor) -> Tensor:
         tensor([1.0000, 0.3679])
     """
     distance = torch.linalg.vector_norm(position - goal, dim=-1)
-    return torch.exp(-distance / torch.linalg.vector_norm(goal, dim=-1))
+    score = torch.exp(-distance / torch.linalg.vector_norm(goal, dim=-1))
+    return score.masked_fill(score_is_undefined(goal), torch.nan)
 
 
 def mean_and_error(values: Tensor) -> tuple[float, float | None]:

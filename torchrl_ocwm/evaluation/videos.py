@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as imageio
+import imageio_ffmpeg
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -14,6 +16,7 @@ from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.data.dataset import EpisodeDataset
 from torchrl_ocwm.evaluation.objects import decode_objects
 from torchrl_ocwm.evaluation.open_loop import open_loop_latents
+from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.modules import ObjectWorldModel, WorldModel
 
 
@@ -42,12 +45,27 @@ def write_video(path: str | Path, frames: Tensor, *, fps: int = 15, scale: int =
         frames: ``[T, 3, H, W]`` uint8.
         fps: Frames per second.
         scale: Size of a pixel in the video.
+
+    Raises:
+        OutputError: if it cannot be written.
     """
     images = frames.permute(0, 2, 3, 1).numpy().repeat(scale, 1).repeat(scale, 2)
     # H.264 takes even sizes only.
     images = np.pad(images, [(0, 0), (0, images.shape[1] % 2), (0, images.shape[2] % 2), (0, 0)])
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    imageio.imwrite(path, images, fps=fps, codec="libx264", macro_block_size=1, plugin="FFMPEG")
+    options: dict[str, Any] = {"codec": "libx264", "macro_block_size": 1, "ffmpeg_log_level": "quiet"}
+    with writing(path) as file:
+        imageio.imwrite(file, images, plugin="FFMPEG", fps=fps, **options)
+        _check_whole(file, len(images))
+
+
+def _check_whole(file: Path, frames: int) -> None:
+    """FFmpeg ends without an error that can be caught when the disk is full."""
+    try:
+        written, _ = imageio_ffmpeg.count_frames_and_secs(file)
+    except RuntimeError:
+        written = 0
+    if written != frames:
+        raise OSError(f"ffmpeg wrote {written} of {frames} frames; is the disk full?")
 
 
 def tile(rows: list[Tensor], gap: int = 2) -> Tensor:

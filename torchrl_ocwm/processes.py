@@ -1,0 +1,226 @@
+"""Objects that live in processes of their own, which end with the process that started them, however it ends."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import socket
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, Protocol
+
+import cloudpickle
+import torch
+
+#: Makes the object, given a function to call now and then while it works: a sign of life.
+Make = Callable[[Callable[[], None]], Any]
+_START = 120.0  # seconds: a process has to import PyTorch and to load a simulator
+_SIGN = None
+
+
+class WorkerError(RuntimeError):
+    """A process has ended, or gives no sign of life any more."""
+
+
+class Worker(Protocol):
+    """An object whose methods are called in two steps, so that several can work at the same time."""
+
+    def ready(self) -> None:
+        """Wait until the object is made."""
+
+    def request(self, method: str, *arguments: Any) -> None:
+        """Begin a call."""
+
+    def answer(self) -> Any:
+        """Wait for the result of the call, or raise what it raised."""
+
+    def close(self) -> None:
+        """End it at once."""
+
+
+def make_worker(make: Make, *, process: bool, timeout: float) -> Worker:
+    """An object with the method calls of :class:`Worker`.
+
+    Args:
+        make: Makes the object; see :data:`Make`.
+        process: Whether it gets a process of its own.
+        timeout: Seconds without a sign of life after which a process counts as hanging.
+
+    Examples:
+        >>> worker = make_worker(lambda alive: [3, 1, 2], process=False, timeout=10)
+        >>> worker.request("index", 2)
+        >>> worker.answer()
+        2
+    """
+    return ProcessWorker(make, timeout) if process else LocalWorker(make)
+
+
+class LocalWorker:
+    """An object in this process; takes the first argument of :func:`make_worker`."""
+
+    def __init__(self, make: Make) -> None:
+        self._object = make(lambda: None)
+        self._call: tuple[str, tuple[Any, ...]] = ("", ())
+
+    def ready(self) -> None:
+        """Nothing to wait for."""
+
+    def request(self, method: str, *arguments: Any) -> None:
+        """Note the call; the answer does it."""
+        self._call = method, arguments
+
+    def answer(self) -> Any:
+        """Call the method."""
+        method, arguments = self._call
+        return getattr(self._object, method)(*arguments)
+
+    def close(self) -> None:
+        """Close the object, if it can be closed."""
+        getattr(self._object, "close", lambda: None)()
+
+
+class ProcessWorker:
+    """An object in a process of its own.
+
+    The process leaves Ctrl-C to the one that started it. It ends when that one closes it, or has ended itself. What
+    the object raises is raised here, with the traceback of there, and ends the process.
+
+    Args:
+        make: Makes the object, in the process.
+        timeout: Seconds without a sign of life after which it counts as hanging.
+    """
+
+    def __init__(self, make: Make, timeout: float) -> None:
+        ours, theirs = socket.socketpair()
+        self._timeout, self._socket, self._answers = timeout, ours, ours.makefile("rb")
+        with theirs, _interrupts_ignored():
+            self._process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True)
+            self._process.start()
+        self._socket.settimeout(max(timeout, _START))
+        self._send(cloudpickle.dumps(make))
+
+    def ready(self) -> None:
+        """Wait until the object is made.
+
+        Raises:
+            WorkerError: if the process ends before, or hangs.
+        """
+        self.answer()
+        self._socket.settimeout(self._timeout)
+
+    def request(self, method: str, *arguments: Any) -> None:
+        """Begin a call. That of a process which has ended is noticed by :meth:`answer`."""
+        with suppress(OSError):
+            self._send((method, arguments))
+
+    def answer(self) -> Any:
+        """Wait for the result of the call, or raise what it raised.
+
+        Raises:
+            WorkerError: if the process has ended, or hangs.
+        """
+        answer: Any = _SIGN
+        if self._socket.fileno() < 0:
+            raise WorkerError("the process was closed")
+        try:
+            while answer is _SIGN:
+                answer = pickle.load(self._answers)
+        except TimeoutError:
+            raise WorkerError(
+                f"process {self._process.pid} has given no sign of life for {self._socket.gettimeout():g} seconds"
+            ) from None
+        except (EOFError, OSError, pickle.UnpicklingError):
+            self._process.join(1)
+            raise WorkerError(f"process {self._process.pid} has ended ({_how(self._process.exitcode)})") from None
+        result, error, there = answer
+        if error is not None:
+            raise error from _ThereError(there)
+        return result
+
+    def close(self) -> None:
+        """Kill the process. It keeps nothing that would have to be written, and may hang."""
+        if self._socket.fileno() < 0:
+            return
+        self._process.kill()
+        self._process.join()
+        self._process.close()
+        self._answers.close()
+        self._socket.close()
+
+    def _send(self, message: Any) -> None:
+        self._socket.sendall(pickle.dumps(message))
+
+
+class _ThereError(Exception):
+    """Shows the traceback of a process beside the one of this."""
+
+    def __str__(self) -> str:
+        return f"\n{self.args[0]}"
+
+
+def _how(code: int | None) -> str:
+    if code is None:
+        return "its exit code is not known"
+    return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """What is started here is born deaf to Ctrl-C: it would show a traceback while it starts."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _serve(channel: socket.socket) -> None:
+    """The process: make the object, then answer calls until the other end is closed."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    torch.set_num_threads(1)
+    calls = channel.makefile("rb")
+    last = time.monotonic()
+
+    def send(message: Any) -> None:
+        channel.sendall(pickle.dumps(message))
+
+    def alive() -> None:
+        nonlocal last
+        if time.monotonic() - last > 1:
+            last = time.monotonic()
+            send(_SIGN)
+
+    try:
+        made = pickle.loads(pickle.load(calls))(alive)
+        send((None, None, ""))
+        while True:
+            method, arguments = pickle.load(calls)
+            send((getattr(made, method)(*arguments), None, ""))
+    except (EOFError, ConnectionError):
+        return
+    except Exception as error:
+        with suppress(ConnectionError):
+            send((None, _picklable(error), traceback.format_exc()))
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _picklable(error: Exception) -> Exception:
+    """The error, or its name and message where it does not survive the journey."""
+    try:
+        return pickle.loads(pickle.dumps(error))
+    except Exception:  # whatever an exception's own methods raise
+        return RuntimeError(f"{type(error).__name__}: {error}")
