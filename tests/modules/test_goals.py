@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -8,7 +9,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from torchrl_ocwm.agents import Agent
+from torchrl_ocwm.agents import SIZES, Agent, build_agent
 from torchrl_ocwm.modules import FrameGoals, GivenGoals, MixedGoals, UnitRMS, WorkspaceUnits
 from torchrl_ocwm.modules.rewards import LatentSimilarity
 from torchrl_ocwm.testing import random_records, reacher_task
@@ -190,6 +191,19 @@ def test_lengths_stay_where_training_and_reward_compare_them(make_agent: Any, re
     torch.testing.assert_close(goals["position"], encoded)
     for kind, goal in goals.items():
         assert goal.norm(dim=-1).std() > 0.01, kind
+
+
+@pytest.mark.usefixtures("no_noise")
+@pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
+def test_goal_images_in_floating_point(style: Any) -> None:
+    policy = build_agent("focus_lcp", reacher_task(), replace(SIZES["debug"], style=style)).policy()
+    image = random_records(reacher_task(), 4, 1, seed=1)["next", "pixels"][:, 0]
+    goals = [
+        policy(observation(4).set("goal", TensorDict({"pixels": pixels}, [4])))["latent", "goal"]
+        for pixels in (image, image.float() / 255, image.double() / 255)
+    ]
+    torch.testing.assert_close(goals[1], goals[0])
+    torch.testing.assert_close(goals[2], goals[0])
 
 
 @pytest.mark.usefixtures("no_noise")

@@ -7,11 +7,12 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
+from torchrl.modules import RSSMRolloutV3
 
 from torchrl_ocwm.agents import SIZES, Agent, build_agent
 from torchrl_ocwm.modules import ImaginationEnv
 from torchrl_ocwm.settings import change
-from torchrl_ocwm.testing import STYLES, reacher_task
+from torchrl_ocwm.testing import STYLES, random_records, reacher_task
 
 
 @pytest.fixture
@@ -100,3 +101,21 @@ def test_actions_beyond_the_bounds_count_as_clipped(style: Any) -> None:
     second = agent.model.transition()(clipped)
     torch.testing.assert_close(first["latent", "belief"], second["latent", "belief"])
     torch.testing.assert_close(first["latent", "state"], second["latent", "state"])
+
+
+@pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
+def test_recorded_actions_count_as_imagined_ones(style: Any) -> None:
+    """Beyond the bounds they are clipped, and double precision is no other action."""
+    agent = build_agent("dreamer_pcp", reacher_task(), replace(SIZES["debug"], style=style))
+    records, after = random_records(reacher_task(), 2, 4), []
+    for action in (4 * records["action"], (4 * records["action"]).clamp(-1, 1).double()):
+        torch.manual_seed(1)
+        after.append(agent.model.records()(records.clone().set("action", action))["next"])
+    torch.testing.assert_close(after[0]["belief"], after[1]["belief"])
+    assert (4 * records["action"]).abs().max() > 1
+
+
+@pytest.mark.parametrize("name", ["dreamer_pcp", "focus_lcp"])
+def test_sequences_take_torchrls_fast_path(make_agent: Any, name: str) -> None:
+    rollouts = [module for module in make_agent(name).loss.modules() if isinstance(module, RSSMRolloutV3)]
+    assert [rollout._fast_path for rollout in rollouts] == [True]

@@ -99,6 +99,14 @@ def test_initial_latent_keeps_what_is_there() -> None:
     assert filled["belief"].eq(0).all()
 
 
+def test_vectors_and_positions_in_double_precision() -> None:
+    encoder = ObservationEncoder(16, 3, cnn_depth=2, cnn_mults=(1, 2), mlp_layers=1, mlp_units=4)
+    pixels, vectors = torch.zeros(2, 3, 16, 16, dtype=torch.uint8), torch.rand(2, 3, dtype=torch.float64)
+    torch.testing.assert_close(encoder(pixels, vectors), encoder(pixels, vectors.float()))
+    units = WorkspaceUnits((-0.2,), (0.2,))
+    assert units(torch.tensor([0.1], dtype=torch.float64)).dtype == torch.float32
+
+
 def test_encoder_needs_the_shapes_it_was_built_for() -> None:
     encoder = ObservationEncoder(16, 3, cnn_depth=2, cnn_mults=(1, 2), mlp_layers=1, mlp_units=4)
     pixels = torch.zeros(2, 3, 16, 16, dtype=torch.uint8)

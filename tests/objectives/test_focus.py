@@ -225,8 +225,8 @@ def test_weights_and_keys(make_agent: Any, records: TensorDict) -> None:
     ("settings", "message"),
     [
         ({"lambda_pixels": 0.0}, "lambda_pixels does nothing: FOCUSModelLoss has the terms .*object_pixels"),
-        ({"lambda_positional": 1.0}, "lambda_positional does nothing.*'positional_latent'"),
-        ({"lambda_image_latent": 1.0}, "lambda_image_latent does nothing.*'image_latent'"),
+        ({"lambda_positional": 1.0}, "lambda_positional does nothing.*not write next.positional_latent"),
+        ({"lambda_image_latent": 1.0}, "lambda_image_latent does nothing.*not write next.image_latent"),
         ({"positional_distance": "cosine"}, "positional_distance does nothing"),
         ({"positional_gradient": "both"}, "positional_gradient does nothing"),
         ({"positional_distance": "cos"}, "positional_distance must be one of 'cosine', 'mse', got 'cos'"),

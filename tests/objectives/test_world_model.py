@@ -126,7 +126,7 @@ def test_the_batch_is_left_alone(make_agent: Any, records: TensorDict) -> None:
 
 def test_a_missing_key_is_named(make_agent: Any, records: TensorDict) -> None:
     del records["next", "proprio"]
-    with pytest.raises(KeyError, match=r"lacks.*next.*proprio.*which the world model reads"):
+    with pytest.raises(KeyError, match=r"lacks next.proprio, which the world model reads.*it has action, is_init,"):
         WorldModelLoss(make_agent().model.records())(records)
 
 
@@ -163,9 +163,9 @@ def test_in_keys_are_what_is_read(make_agent: Any, records: TensorDict, name: st
         torch.testing.assert_close(got[key], value)
     assert list(expected.keys()) == loss.out_keys
     for key in loss.in_keys:
-        with pytest.raises(KeyError) as error:
+        name = key if isinstance(key, str) else ".".join(key)
+        with pytest.raises(KeyError, match=f"the batch lacks {name}, which the world model reads"):
             loss(records.exclude(key))
-        assert error.value.args[0].startswith(f"the batch lacks [{key!r}], which the world model reads")
 
 
 def test_the_recorded_reward_is_the_target(make_agent: Any, records: TensorDict) -> None:
@@ -230,7 +230,7 @@ def test_images_in_floating_point(records: TensorDict, name: str, style: Any, dt
 
 def test_a_weight_without_its_term_is_refused(make_agent: Any, records: TensorDict) -> None:
     world_model = make_agent("dreamer_pcp").model.records()
-    with pytest.raises(ValueError, match=r"lambda_goal_position does nothing.*not write.*reco_goal_units"):
+    with pytest.raises(ValueError, match=r"lambda_goal_position does nothing.*not write next.reco_goal_units"):
         WorldModelLoss(world_model, lambda_goal_position=9.0)(records)
 
 
@@ -239,10 +239,10 @@ def test_a_weight_without_its_term_is_refused(make_agent: Any, records: TensorDi
     [
         (
             {"reco_proprio": "reco_propio"},
-            r"reco_proprio='reco_propio'.*does not write.*'reco_propio'.*reco_pixels",
+            r"reco_proprio='reco_propio'.*does not write next.reco_propio; it writes.*next.reco_pixels",
         ),
-        ({"posterior_logits": "logits"}, "does not write.*'logits'"),
-        ({"reco_goal_position": ("a", "b")}, "does not write.*'next', 'a', 'b'"),
+        ({"posterior_logits": "logits"}, "does not write next.logits"),
+        ({"reco_goal_position": ("a", "b")}, "does not write next.a.b"),
         ({"true_reward": "reward"}, "WorldModelLoss does not use the key 'true_reward'"),
     ],
 )
@@ -255,7 +255,7 @@ def test_keys_that_would_do_nothing(make_agent: Any, keys: Any, message: str) ->
 def test_a_mistyped_target_is_named(make_agent: Any, records: TensorDict) -> None:
     loss = WorldModelLoss(make_agent("dreamer_pcp").model.records())
     loss.set_keys(proprio="propio")
-    with pytest.raises(KeyError, match=r"lacks.*propio.*, which the world model reads or learns to predict"):
+    with pytest.raises(KeyError, match=r"lacks next.propio, which the world model reads or learns to predict"):
         loss(records)
 
 

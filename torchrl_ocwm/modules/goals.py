@@ -156,11 +156,11 @@ class GivenGoals(TensorDictModuleBase):
     Args:
         units: Workspace units of positions.
         position: Encodes positions ``[..., D]`` in workspace units, to ``[..., G]``; ``None``: they are not understood.
-        image: Encodes images ``[..., F, 3, H, W]`` uint8, to ``[..., G]``; ``None``: images are not understood.
+        image: Encodes images ``[..., F, 3, H, W]``, to ``[..., G]``; ``None``: images are not understood.
         goal_key: Key written, ``[*batch, G]``.
 
     Reads ``goal_position`` ``[*batch, D]`` or ``("goal", "position")`` ``[*batch, D]``, both in metres, and
-    ``("goal", "pixels")`` ``[*batch, 3, H, W]`` or ``[*batch, F, 3, H, W]`` uint8.
+    ``("goal", "pixels")`` ``[*batch, 3, H, W]`` or ``[*batch, F, 3, H, W]``, uint8 or floating point in [0, 1].
 
     Raises:
         ValueError: when called, for a position or an image that is not understood, or a goal that is neither.

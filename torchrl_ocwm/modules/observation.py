@@ -23,7 +23,7 @@ class ObservationEncoder(nn.Module):
         mlp_units: Units of each.
         style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
 
-    Called with ``pixels`` ``[..., 3, H, W]``, uint8 or floating point in [0, 1], and vectors ``[..., any]`` float32;
+    Called with ``pixels`` ``[..., 3, H, W]``, uint8 or floating point in [0, 1], and vectors ``[..., any]``;
     returns ``[..., features]`` float32. Without vectors their part of the embedding is zero (:meth:`image_alone`).
 
     Raises:
@@ -63,7 +63,7 @@ class ObservationEncoder(nn.Module):
             return image
         if not vectors:
             return pad(image, (0, self.features - image.shape[-1]))
-        return torch.cat([image, self.mlp(symlog(torch.cat(vectors, -1)))], -1)
+        return torch.cat([image, self.mlp(symlog(torch.cat(vectors, -1).float()))], -1)
 
     def image_alone(self, embedding: Tensor) -> Tensor:
         """Embeddings ``[..., features]`` of image and vectors to those that the images have without vectors."""

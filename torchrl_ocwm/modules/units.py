@@ -52,7 +52,7 @@ class WorkspaceUnits(nn.Module):
     def forward(self, metres: Tensor) -> Tensor:
         if metres.shape[-1] != self.dim:
             raise ValueError(f"positions have {self.dim} coordinates here, got shape {tuple(metres.shape)}")
-        return (metres - (self.low + self.high) / 2) / self.metres_per_unit
+        return (metres.to(self.low.dtype) - (self.low + self.high) / 2) / self.metres_per_unit
 
     def to_metres(self, units: Tensor) -> Tensor:
         """Positions ``[..., D]`` in metres."""

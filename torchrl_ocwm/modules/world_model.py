@@ -111,11 +111,14 @@ class WorldModel(nn.Module, ABC):
     # Modules for training on records.
 
     def records(self) -> TensorDictSequential:
-        """Posterior, prior and predictions for records ``[B, T]``; everything is read and written under ``next``."""
+        """Posterior, prior and predictions for records ``[B, T]``; all but actions is read and written under ``next``.
+
+        Recorded actions beyond [−1, 1] count as clipped, as they do in imagination and in acting.
+        """
         rollout = RSSMRolloutV3(
             TensorDictModule(
                 self.prior,
-                in_keys=["state", "belief", "action"],
+                in_keys=["state", "belief", "bounded_action"],
                 out_keys=[("next", "prior_logits"), ("next", "state"), ("next", "belief")],
             ),
             TensorDictModule(
@@ -126,7 +129,11 @@ class WorldModel(nn.Module, ABC):
         )
         rollout.in_keys = [*rollout.in_keys, "is_init"]  # TorchRL's takes it as optional: then memory crosses episodes
         return TensorDictSequential(
-            InitialLatent(self.state, self.belief), *self._encode("next"), rollout, *self.decoders("next")
+            InitialLatent(self.state, self.belief),
+            TensorDictModule(_bounded, ["action"], ["bounded_action"]),
+            *self._encode("next"),
+            rollout,
+            *self.decoders("next"),
         )
 
     def decoders(self, *at: str) -> list[TensorDictModuleBase]:
@@ -288,6 +295,7 @@ class _ObjectUnits(nn.Module):
 
 def _bounded(action: Tensor) -> Tensor:
     """Clip to [−1, 1] and keep a gradient beyond, as TorchRL's block GRU does by itself."""
+    action = action.float()
     return action / action.detach().abs().clamp_min(1)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -233,7 +233,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
         predicted = {name: term for name, term in self.terms().items() if self._key(term.prediction) in written}
         for setting, name in self._given.items():
             if name not in predicted:
-                key = self._key(self.terms()[name].prediction)
+                key = _names([self._key(self.terms()[name].prediction)])
                 raise ValueError(f"{setting} does nothing: the world model does not write {key}, which it is about")
         return predicted
 
@@ -269,8 +269,8 @@ class WorldModelLoss(DreamerV3ModelLoss):
                 raise ValueError(f"{type(self).__name__} does not use the key {name!r}")
             if name in predictions and self._key(name) not in self._written():
                 raise ValueError(
-                    f"{name}={kwargs[name]!r}: the world model does not write {self._key(name)}; it writes "
-                    f"{', '.join(map(str, self._written()))}"
+                    f"{name}={kwargs[name]!r}: the world model does not write {_names([self._key(name)])}; it writes "
+                    f"{_names(self._written())}"
                 )
 
     def forward(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
@@ -278,8 +278,8 @@ class WorldModelLoss(DreamerV3ModelLoss):
         missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
         if missing:
             raise KeyError(
-                f"the batch lacks {missing}, which the world model reads or learns to predict; it has "
-                f"{sorted(_names(tensordict))}"
+                f"the batch lacks {_names(missing)}, which the world model reads or learns to predict; it has "
+                f"{_names(tensordict.keys(True, True))}"
             )
         # A new container: the caller's batch stays as it is.
         records = self.world_model(tensordict.select(*tensordict.keys(True, True)))
@@ -325,5 +325,6 @@ class WorldModelLoss(DreamerV3ModelLoss):
         return two_hot_cross_entropy(logits, reward.float(), self.reward_bins).mean()
 
 
-def _names(tensordict: TensorDictBase) -> list[str]:
-    return [str(key) for key in tensordict.keys(True, True)]
+def _names(keys: Iterable[NestedKey]) -> str:
+    """Keys as the documentation writes them, ``next.pixels``."""
+    return ", ".join(sorted(key if isinstance(key, str) else ".".join(key) for key in keys))
