@@ -30,13 +30,21 @@ def kept(path: Path) -> float:
     return there.weight[0, 0].item()
 
 
+def refuses(path: Path) -> bool:
+    try:
+        read_manifest(path)
+    except CheckpointError:
+        return True
+    return False
+
+
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     return Archive(layer=layer(1.0)).save(tmp_path / "checkpoint.zip")
 
 
-# Kills a process before the n-th of its calls that touch files, for n = 0, 1, ... until it lives. Of calls of one kind in
-# a row only the first counts.
+# Kills a process before the n-th of its calls that touch files, for n = 0, 1, ... until it lives. Of calls of one kind
+# in a row only the first counts.
 _KILLS = """
 import os, shutil, sys
 from pathlib import Path
@@ -161,13 +169,10 @@ class TestDamage:
             if place % 7 and place not in (contents[0][0], contents[-1][-1]):
                 continue
             flipped.write_bytes(data[:place] + bytes([data[place] ^ 1 << place % 8]) + data[place + 1 :])
-            try:
-                read_manifest(flipped)
-            except CheckpointError as error:
-                assert str(flipped) in str(error)
+            if refuses(flipped):
                 refused.add(place)
-                continue
-            assert kept(flipped) == 1.0, place
+            else:
+                assert kept(flipped) == 1.0, place
         assert refused >= {place for place in inside if place % 7 == 0}
 
     def test_a_lost_member(self, file: Path, tmp_path: Path) -> None:
