@@ -4,6 +4,8 @@ import errno
 import json
 import os
 import signal
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,14 +14,21 @@ from typing import Any
 import pytest
 import torch
 from torchrl.checkpoint import Checkpoint, CheckpointError
+from torchrl.record.loggers import CSVLogger
 
 import torchrl_ocwm
-from torchrl_ocwm.agents import SIZES, Agent, build_agent
+from torchrl_ocwm.agents import SIZES, Agent, build_agent, save_agent
+from torchrl_ocwm.agents.archive import Archive
 from torchrl_ocwm.agents.checkpoint import describe, rebuild
-from torchrl_ocwm.data import DatasetError, EpisodeDataset
-from torchrl_ocwm.settings import SettingsError, change
-from torchrl_ocwm.testing import random_dataset, reacher_task
-from torchrl_ocwm.training.offline import train_offline
+from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals
+from torchrl_ocwm.evaluation import LandmarkEvaluation
+from torchrl_ocwm.evaluation.videos import OpenLoopFilm
+from torchrl_ocwm.files import FolderInUseError
+from torchrl_ocwm.settings import change
+from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
+from torchrl_ocwm.training import hooks
+from torchrl_ocwm.training.loggers import LogError
+from torchrl_ocwm.training.offline import EvaluationError, train_offline
 from torchrl_ocwm.training.settings import Training
 
 SHORT = Training(updates=12, log_interval=2, checkpoint_interval=4, eval_interval=2)
@@ -42,6 +51,20 @@ def train(agent: Agent, dataset: EpisodeDataset, folder: Path, training: Trainin
 def same(first: Agent, second: Agent) -> bool:
     pairs = zip(first.state_dict().items(), second.state_dict().items(), strict=True)
     return all(name == other and torch.equal(value, there) for (name, value), (other, there) in pairs)
+
+
+def updates_in(file: Path) -> int:
+    counts: dict[str, int] = {}
+
+    class State:
+        def state_dict(self) -> dict[str, int]:
+            return {}
+
+        def load_state_dict(self, state: dict[str, int]) -> None:
+            counts.update(state)
+
+    Archive(trainer_state=State()).load(file)
+    return counts["collected_frames"]
 
 
 def signal_at(updates: int, number: int) -> Callable[[int], dict[str, float]]:
@@ -99,6 +122,217 @@ class TestResume:
         assert not same(first, second)
 
 
+class TestGoingOn:
+    """A run that goes on is held to the dataset and to the settings that decide what is learnt."""
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"goals": "stored"}, r"training\.goals: uniform there, stored here\); say training\.changed=\[goals\]"),
+            ({"final_lr": 0.5}, r"training\.final_lr: 0\.1 there, 0\.5 here"),
+            ({"target_rate": 0.5}, r"training\.target_rate: 0\.02 there, 0\.5 here"),
+            ({"mixed_precision": True}, r"training\.mixed_precision: False there, True here"),
+            ({"seed": 1}, r"training\.seed: 0 there, 1 here\); choose another output folder"),
+        ],
+    )
+    def test_a_finished_run_with_other_settings_is_refused(
+        self, dataset: EpisodeDataset, tmp_path: Path, changes: dict[str, Any], message: str
+    ) -> None:
+        training = replace(SHORT, updates=2)
+        file = train(fresh(), dataset, tmp_path, training)
+        before, started = file.read_bytes(), []
+        for updates in (2, 4):
+            changed = replace(training, updates=updates, **changes)
+            with pytest.raises(CheckpointError, match=message):
+                train(fresh(), dataset, tmp_path, changed, on_start=lambda: started.append(1))
+        assert file.read_bytes() == before
+        assert not started
+
+    def test_what_is_said_to_have_changed_is_changed(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        training = replace(SHORT, updates=2)
+        file = train(fresh(), dataset, tmp_path, training)
+        other = replace(training, updates=4, final_lr=0.5, changed=("final_lr",))
+        train(fresh(), dataset, tmp_path, other)
+        train(fresh(), dataset, tmp_path, replace(other, changed=()))  # the checkpoint has it now
+        with pytest.raises(CheckpointError, match=r"final_lr: 0\.5 there, 0\.1 here"):
+            train(fresh(), dataset, tmp_path, training)
+        assert Checkpoint.manifest(file)["metadata"]["trained_with"]["training"]["final_lr"] == 0.5
+
+    def test_what_changes_nothing_may_change(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        train(fresh(), dataset, tmp_path, replace(SHORT, updates=2))
+        free = {"log_interval": 1, "checkpoint_interval": 1, "eval_interval": 0, "video_interval": 0, "threads": 1}
+        train(fresh(), dataset, tmp_path, replace(SHORT, updates=4, **free))
+
+    def test_another_dataset(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        other = random_dataset(tmp_path / "other", reacher_task(), episodes=5)
+        other_first = random_dataset(tmp_path / "first", reacher_task(), episodes=1)
+        train(fresh(), other, tmp_path / "run", replace(SHORT, updates=2))
+        with pytest.raises(CheckpointError, match=r"5 other episodes there than in .*first.*changed=\[dataset\]"):
+            train(fresh(), other_first, tmp_path / "run", replace(SHORT, updates=2))
+        moved = EpisodeDataset.open((tmp_path / "other").rename(tmp_path / "moved"))
+        train(fresh(), moved, tmp_path / "run", replace(SHORT, updates=2))
+
+    def test_another_dataset_of_the_same_shape(self, tmp_path: Path) -> None:
+        other = random_dataset(tmp_path / "other", reacher_task())
+        train(fresh(), other, tmp_path / "run", replace(SHORT, updates=2))
+        actions = EpisodeDataset.open(tmp_path / "other").records["action"]
+        (tmp_path / "other" / "frames" / "action.memmap").write_bytes((0.5 * actions).numpy().tobytes())
+        with pytest.raises(CheckpointError, match="4 other episodes there"):
+            train(fresh(), EpisodeDataset.open(tmp_path / "other"), tmp_path / "run", replace(SHORT, updates=2))
+
+    def test_a_dataset_that_has_grown(self, tmp_path: Path) -> None:
+        grown = random_dataset(tmp_path / "data", reacher_task())
+        training = replace(SHORT, updates=2)
+        file = train(fresh(), grown, tmp_path / "run", training)
+        records = random_records(reacher_task(), 1, 20, seed=7)[0]
+        grown.append(records)
+        with pytest.raises(CheckpointError, match=r"has grown by 1 episodes\); say training\.changed=\[dataset\]"):
+            train(fresh(), grown, tmp_path / "run", training)
+        train(fresh(), grown, tmp_path / "run", replace(training, updates=4, changed=("dataset",)))
+        assert Checkpoint.manifest(file)["metadata"]["trained_with"]["dataset"]["episodes"] == 5
+
+    def test_fewer_updates_than_there_are_train_nothing_and_say_so(
+        self, dataset: EpisodeDataset, tmp_path: Path
+    ) -> None:
+        train(fresh(), dataset, tmp_path, replace(SHORT, updates=4))
+        with pytest.warns(RuntimeWarning, match="has 4 updates, more than 2; nothing was trained"):
+            train(fresh(), dataset, tmp_path, replace(SHORT, updates=2))
+
+    def test_an_agent_without_the_state_of_training(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        save_agent(fresh(), tmp_path / "checkpoint.zip")
+        with (
+            pytest.warns(RuntimeWarning, match="are not compared"),
+            pytest.raises(CheckpointError, match=r"checkpoint\.zip: cannot be loaded .*missing.*trainer_state"),
+        ):
+            train(fresh(), dataset, tmp_path)
+
+    def test_starts_once(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        started: list[int] = []
+        for updates in (2, 2, 4):
+            training = replace(SHORT, updates=updates)
+            train(fresh(), dataset, tmp_path, training, on_start=lambda: started.append(1))
+            assert len(started) == (1 if updates == 2 else 2)
+
+    def test_two_runs_in_one_folder(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        refused: list[str] = []
+
+        def second(updates: int) -> dict[str, float]:
+            with pytest.raises(FolderInUseError, match=f"process {os.getpid()} is writing here") as raised:
+                train(fresh(), dataset, tmp_path)
+            refused.append(str(raised.value))
+            return {}
+
+        train(fresh(), dataset, tmp_path, replace(SHORT, updates=2), evaluate=second)
+        assert len(refused) == 1
+
+
+class TestLooking:
+    """Evaluations and films cannot lose work."""
+
+    def test_an_evaluation_that_fails_leaves_its_update(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        def fails(updates: int) -> dict[str, float]:
+            if updates == 6:
+                raise OSError("no display")
+            return {}
+
+        message = r"evaluation after 6 updates failed \(OSError: no display\); the checkpoint of this update is kept"
+        with pytest.raises(EvaluationError, match=message):
+            train(fresh(), dataset, tmp_path, evaluate=fails)
+        resumed, through, seen = fresh(), fresh(), []
+        train(resumed, dataset, tmp_path, evaluate=lambda updates: seen.append(updates) or {})
+        assert seen == [8, 10, 12]
+        train(through, dataset, tmp_path / "through")
+        assert same(resumed, through)
+
+    def test_the_checkpoint_that_is_due_comes_before_the_evaluation(
+        self, dataset: EpisodeDataset, tmp_path: Path
+    ) -> None:
+        seen: dict[int, int] = {}
+
+        def evaluate(updates: int) -> dict[str, float]:
+            file = tmp_path / "checkpoint.zip"
+            seen[updates] = updates_in(file) if file.exists() else 0
+            return {}
+
+        train(fresh(), dataset, tmp_path, evaluate=evaluate)
+        assert seen == {2: 0, 4: 4, 6: 4, 8: 8, 10: 8, 12: 12}
+
+    def test_a_film_that_fails_is_a_warning(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        def fails(updates: int) -> Path:
+            raise RuntimeError("no ffmpeg")
+
+        training = replace(SHORT, updates=4, video_interval=4)
+        with pytest.warns(RuntimeWarning, match=r"no video after 4 updates \(RuntimeError: no ffmpeg\)"):
+            file = train(fresh(), dataset, tmp_path, training, film=fails)
+        assert updates_in(file) == 4
+
+    def test_too_few_landmarks_are_named_before_training(self) -> None:
+        with pytest.raises(ValueError, match="2 evaluation episodes, but reacher has 0 landmarks"):
+            LandmarkEvaluation(fresh(), episodes=2, episode_steps=3)
+
+    def test_no_ffmpeg_is_named_before_training(
+        self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+        with pytest.raises(ModuleNotFoundError, match=r"torchrl-ocwm\[recipes\]'.*video_interval=0"):
+            OpenLoopFilm(fresh(), dataset, tmp_path)
+
+    def test_no_tqdm_is_named_before_training(
+        self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(hooks, "find_spec", lambda name: None)
+        with pytest.raises(ModuleNotFoundError, match=r"needs tqdm: pip install 'torchrl-ocwm\[recipes\]'"):
+            train_offline(fresh(), dataset, tmp_path / "run", SHORT)
+        assert not (tmp_path / "run").exists()
+        train(fresh(), dataset, tmp_path / "run", replace(SHORT, updates=2))
+
+    def test_no_such_device(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        for device in ("cuda:99", "gpu"):
+            with pytest.raises(ValueError, match=f"device '{device}' cannot be used .*; device 'cpu' always can"):
+                train(fresh(), dataset, tmp_path / "run", replace(SHORT, device=device))
+        assert not (tmp_path / "run").exists()
+
+
+class TestSignals:
+    @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+    def test_a_signal_between_two_lines_of_the_log(
+        self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+    ) -> None:
+        """Ends the run after the update at hand, and the run goes on there bit for bit."""
+        training = replace(SHORT, log_interval=6, checkpoint_interval=100, eval_interval=5)
+        relabel, batches = RelabelGoals.forward, []
+
+        def at_third(self: Any, batch: Any) -> Any:
+            batches.append(1)
+            if len(batches) == 3:
+                os.kill(os.getpid(), number)
+            return relabel(self, batch)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(RelabelGoals, "forward", at_third)
+            file = train(fresh(), dataset, tmp_path, training)
+        assert updates_in(file) == 3
+        resumed, through, seen = fresh(), fresh(), []
+        train(resumed, dataset, tmp_path, training, evaluate=lambda updates: seen.append(updates) or {})
+        assert seen == [5, 10]
+        train(through, dataset, tmp_path / "through", training)
+        assert same(resumed, through)
+
+    def test_a_signal_breaks_off_an_evaluation(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        def endless(updates: int) -> dict[str, float]:
+            os.kill(os.getpid(), signal.SIGTERM)
+            while True:
+                time.sleep(0.01)
+
+        file = train(fresh(), dataset, tmp_path, evaluate=endless)
+        assert updates_in(file) == 2
+
+    def test_handlers_are_given_back(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+        train(fresh(), dataset, tmp_path, replace(SHORT, updates=2))
+        assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
 class TestLogs:
     def test_csv(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         train(fresh(), dataset, tmp_path, evaluate=lambda updates: {"evaluation/score": float(updates)})
@@ -107,6 +341,60 @@ class TestLogs:
             f"{n},{float(n)}" for n in (2, 4, 6, 8, 10, 12)
         ]
         assert len((scalars / "loss_actor.csv").read_text().split()) == 6
+
+    def test_losses_are_averaged_between_two_lines(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        lines = {}
+        for interval in (1, 4):
+            train(fresh(), dataset, tmp_path / str(interval), replace(SHORT, updates=6, log_interval=interval))
+            rows = (tmp_path / str(interval) / "log" / "scalars" / "loss_value.csv").read_text().split()
+            lines[interval] = [tuple(map(float, row.split(","))) for row in rows]
+        values = [value for _, value in lines[1]]
+        expected = [(4, sum(values[:4]) / 4), (6, sum(values[4:]) / 2)]  # the last update has a line too
+        assert [step for step, _ in lines[4]] == [step for step, _ in expected]
+        assert [value for _, value in lines[4]] == pytest.approx([value for _, value in expected], rel=1e-5)
+
+    def test_a_run_that_goes_on_repeats_no_line(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        """Killed after the line of update 10 had been written, with a checkpoint of update 8."""
+
+        class Killed(BaseException):
+            pass
+
+        def kill(updates: int) -> dict[str, float]:
+            if updates == 10:
+                raise Killed
+            return {"evaluation/score": float(updates)}
+
+        training = replace(SHORT, checkpoint_interval=4, updates=12)
+        with pytest.raises(Killed):
+            train(fresh(), dataset, tmp_path, replace(training, checkpoint_interval=8), evaluate=kill)
+        scalars = tmp_path / "log" / "scalars"
+        with (scalars / "loss_actor.csv").open("a") as file:
+            file.write("12,0.")  # cut off
+        train(fresh(), dataset, tmp_path, training, evaluate=lambda updates: {"evaluation/score": float(updates)})
+        for name in ("loss_actor.csv", "evaluation/score.csv"):
+            rows = (scalars / name).read_text().splitlines()
+            assert [row.split(",")[0] for row in rows] == ["2", "4", "6", "8", "10", "12"], name
+
+    def test_a_run_that_starts_anew_forgets_the_lines_of_one_without_a_checkpoint(
+        self, dataset: EpisodeDataset, tmp_path: Path
+    ) -> None:
+        file = train(fresh(), dataset, tmp_path, replace(SHORT, updates=4))
+        file.unlink()
+        train(fresh(), dataset, tmp_path, replace(SHORT, updates=2))
+        assert len((tmp_path / "log" / "scalars" / "loss_actor.csv").read_text().split()) == 1
+
+    def test_a_log_that_cannot_be_written(
+        self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def full(*args: Any, **kwargs: Any) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        file = train(fresh(), dataset, tmp_path, replace(SHORT, updates=2))
+        before = file.read_bytes()
+        monkeypatch.setattr(CSVLogger, "log_scalar", full)
+        with pytest.raises(LogError, match="cannot write the log .No space left on device.; the last checkpoint"):
+            train(fresh(), dataset, tmp_path, replace(SHORT, updates=4))
+        assert file.read_bytes() == before
 
 
 class TestLoadAgent:
@@ -223,8 +511,6 @@ class TestBadInput:
     ) -> None:
         file = train(fresh(), dataset, tmp_path, evaluate=signal_at(4, signal.SIGTERM))
         before = file.read_bytes()
-        from torchrl_ocwm.data import RelabelGoals
-
         relabel = RelabelGoals.forward
 
         def spoiled(self: Any, batch: Any) -> Any:
@@ -242,7 +528,10 @@ class TestBadInput:
     ("changes", "message"),
     [
         ({"updates": 0}, "updates must be at least 1"),
-        ({"updates": 75}, "multiple of log_interval, got 75 and 50"),
+        (
+            {"changed": ("seed",)},
+            "changed must name dataset, goals, .*final_lr, target_rate, got 'seed'",
+        ),
         ({"goals": "mine"}, "goals must be one of 'uniform', 'stored', got 'mine'"),
         ({"loggers": ("paper",)}, "loggers must be one of 'tensorboard', 'wandb', got 'paper'"),
     ],

@@ -59,9 +59,10 @@ class Archive(Checkpoint):
             shutil.rmtree(stage, ignore_errors=True)  # a kill may have left it
             with replacing(path) as new:
                 os.replace(super().save(stage / path.name, **{"metadata": self.metadata, **options}), new)
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # PyTorch's own files raise the second
             kept = f"the checkpoint before it is kept at {path}" if path.exists() else "there was none before it"
-            raise CheckpointError(f"cannot write the checkpoint {path} ({error.strerror or error}); {kept}") from error
+            reason = getattr(error, "strerror", None) or error
+            raise CheckpointError(f"cannot write the checkpoint {path} ({reason}); {kept}") from error
         finally:
             shutil.rmtree(stage, ignore_errors=True)
         return path

@@ -60,12 +60,7 @@ def load_agent(path: str | Path, *, device: torch.device | str = "cpu") -> Polic
         ValueError: if there is no such device.
     """
     path, device = Path(path), usable_device(device)
-    description = read_description(path)
-    with torch.device("meta"):  # shapes without memory
-        needed = sum(value.numel() * value.itemsize for value in rebuild(description).loss.parameters())
-    if needed > path.stat().st_size:
-        raise CheckpointError(f"{path}: describes an agent of {needed} bytes, which cannot be in it; it is damaged")
-    agent = rebuild(description)
+    agent = rebuild(read_description(path))
     Archive(loss_module=agent.loss).load(path, map_location="cpu")
     agent.to(device).eval().requires_grad_(False)
     return agent.policy()
@@ -134,11 +129,14 @@ def read_description(path: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: a TorchRL checkpoint, but not of an agent of torchrl_ocwm ({sorted(components)})"
         )
-    description = Archive(agent={}).load(path).values["agent"]
+    description = Archive(agent={}).load(path).values.get("agent")
     try:
-        read_parts(description)
+        with torch.device("meta"):  # shapes without memory
+            needed = sum(value.numel() * value.itemsize for value in rebuild(description).loss.parameters())
     except CheckpointError as error:
         raise CheckpointError(f"{path}: {error}") from error
+    if needed > path.stat().st_size:
+        raise CheckpointError(f"{path}: describes an agent of {needed} bytes, which cannot be in it; it is damaged")
     return description
 
 
