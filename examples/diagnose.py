@@ -55,7 +55,7 @@ def main(config: DictConfig) -> None:
 
 def _records(config: DictConfig, task: Task) -> TensorDictBase:
     dataset = EpisodeDataset.open(config.dataset)
-    there = Task.from_dict(dataset.metadata["task"])
+    there = dataset.task
     if there != task:
         raise ValueError(f"{dataset.path}: holds {there}, but the agent in {config.checkpoint} is of {task}")
     if not 0 < config.context < config.length:

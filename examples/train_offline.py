@@ -12,7 +12,6 @@ from omegaconf import DictConfig
 
 from torchrl_ocwm.agents import AgentConfig, Size, build_agent
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
-from torchrl_ocwm.envs import Task
 from torchrl_ocwm.evaluation import LandmarkEvaluation
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm
 from torchrl_ocwm.training.config import keep_config, recipe, to_dataclass
@@ -26,12 +25,14 @@ def main(config: DictConfig) -> None:
     dataset = EpisodeDataset.open(config.dataset)
     if dataset.metadata.get("environment") != config.env.name:
         raise DatasetError(f"{dataset.path}: holds {dataset.metadata.get('environment')}, not env={config.env.name}")
-    config.env.options = dataset.metadata["options"]  # whatever the command line says: these are what is trained on
+    config.env.options = dataset.metadata.get(
+        "options", {}
+    )  # whatever the command line says: these are what is trained on
     keep_config(config)
     torch.manual_seed(training.seed)
     agent = build_agent(
         to_dataclass(AgentConfig, config.agent),
-        Task.from_dict(dataset.metadata["task"]),
+        dataset.task,
         to_dataclass(Size, config.size),
     )
     evaluation = LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps)

@@ -6,7 +6,7 @@ import json
 import warnings
 from collections import Counter
 from collections.abc import Callable, Generator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -104,26 +104,28 @@ def collect(
     name, module = make_policy(policy, task)
     dataset = _open_if_there(Path(path), source)
     if dataset is not None and dataset.num_steps >= steps:
-        return _with_coverage(dataset, task)
+        with dataset:
+            return _with_coverage(dataset, task)
     done = dataset.num_steps if dataset is not None else 0
 
     def make_collector(attempt: int) -> MultiSyncCollector:
         return _make_collector(environment, options, module, workers, seed + done + attempt)
 
     bar = tqdm(total=steps, initial=done, unit="step", desc=f"collect {environment}", disable=not progress)
-    with bar, closing(_whole_episodes(make_collector)) as episodes:
+    with bar, ExitStack() as writing, closing(_whole_episodes(make_collector)) as episodes:
+        if dataset is not None:
+            writing.enter_context(dataset)
         for episode, failures in episodes:
             records = episode_to_records(episode).select(*STORED)
             if dataset is None:
-                dataset = EpisodeDataset.create(path, example=records[0], metadata=source)
+                dataset = writing.enter_context(EpisodeDataset.create(path, example=records[0], metadata=source))
             dataset.append(records, **_count(dataset, name, failures), coverage=None)
             bar.update(len(records) - 1)
             if dataset.num_steps >= steps:
                 break
-    if dataset is None:
-        raise DatasetError(f"{path}: the collector ended before the first episode was complete")
-    dataset.trim()
-    return _with_coverage(dataset, task)
+        if dataset is None:
+            raise DatasetError(f"{path}: the collector ended before the first episode was complete")
+        return _with_coverage(dataset, task)
 
 
 def make_policy(policy: str | Path | TensorDictModuleBase, task: Task) -> tuple[str, TensorDictModuleBase]:
@@ -216,9 +218,10 @@ def _with_coverage(dataset: EpisodeDataset, task: Task) -> EpisodeDataset:
 def _open_if_there(path: Path, source: dict[str, Any]) -> EpisodeDataset | None:
     if not (path / "dataset.json").exists():
         return None
-    dataset = EpisodeDataset.open(path, allow_empty=True)  # it may have been killed before the first episode
+    dataset = EpisodeDataset.open(path, write=True)  # it may have been killed before the first episode
     there = {key: dataset.metadata.get(key) for key in source}
     if there != json.loads(json.dumps(source)):
+        dataset.close()
         raise DatasetError(
             f"{path}: holds a dataset of {there['environment']!r} with options {there['options']}, not of "
             f"{source['environment']!r} with {source['options']}; choose another folder"

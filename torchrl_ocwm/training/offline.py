@@ -14,7 +14,6 @@ from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.checkpoint import check_same_agent, describe
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals, make_replay_buffer
-from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.training.hooks import Every, ProgressBar, UpdateClock, stop_on_signals, stop_when_not_finite
 from torchrl_ocwm.training.loggers import Loggers, make_loggers
 from torchrl_ocwm.training.settings import Training
@@ -138,9 +137,12 @@ class RunCheckpoint(Checkpoint):
 
 
 def _check_task(agent: Agent, dataset: EpisodeDataset) -> None:
-    there = Task.from_dict(dataset.metadata["task"])
-    if there != agent.task:
-        raise DatasetError(f"{dataset.path}: holds {there}, but the agent was built for {agent.task}")
+    if dataset.task != agent.task:
+        raise DatasetError(f"{dataset.path}: holds {dataset.task}, but the agent was built for {agent.task}")
+    there = {*dataset.records.keys(True, True), *RelabelGoals.written}
+    missing = [key for key in agent.loss.in_keys if key not in there]
+    if missing:
+        raise DatasetError(f"{dataset.path}: holds no {missing}, which this agent learns from")
 
 
 def _make_folder(folder: Path, training: Training) -> Loggers:

@@ -25,7 +25,7 @@ class Training:
         eval_steps: Steps per episode.
         video_interval: Updates between two open-loop prediction videos; 0 for none.
         goals: Goals of the sampled sequences: ``"uniform"`` draws a fresh one for each, ``"stored"`` keeps those of the
-            dataset.
+            dataset, ``"auto"`` keeps them if the images show them (``virtual_target``), and draws them otherwise.
         compile: Compile the update; ``None`` does so on a GPU only. Takes minutes.
         cudagraph: Capture the update in a CUDA graph; ``None`` does so on a GPU.
         mixed_precision: Products and convolutions in bfloat16. Faster where the device has instructions for it, and the
@@ -46,7 +46,7 @@ class Training:
     eval_episodes: int = 10
     eval_steps: int = 100
     video_interval: int = 2000
-    goals: Literal["uniform", "stored"] = "uniform"
+    goals: Literal["auto", "uniform", "stored"] = "auto"
     compile: bool | None = None
     cudagraph: bool | None = None
     mixed_precision: bool = False
