@@ -75,7 +75,7 @@ def main(config: Diagnose) -> None:
 
 def _records(path: Path, checkpoint: str, task: Task, settings: Diagnosis) -> TensorDictBase:
     dataset = EpisodeDataset.open(path)
-    there = Task.from_dict(dataset.metadata["task"])
+    there = dataset.task
     if there != task:
         raise ValueError(f"{dataset.path}: holds {there}, but the agent in {checkpoint} is of {task}")
     records = random_sequences(dataset, settings.sequences, settings.length, seed=settings.seed)

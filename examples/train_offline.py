@@ -14,7 +14,6 @@ import torch
 from torchrl_ocwm.agents import AgentConfig, Size, build_agent
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.devices import usable_device
-from torchrl_ocwm.envs import Task
 from torchrl_ocwm.envs.registry import EnvChoice
 from torchrl_ocwm.evaluation import LandmarkEvaluation
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm
@@ -55,9 +54,9 @@ def main(config: TrainOffline) -> None:
     if dataset.metadata.get("environment") != config.env.name:
         raise DatasetError(f"{dataset.path}: holds {dataset.metadata.get('environment')}, not env={config.env.name}")
     # Whatever the command line says: the dataset's options are those that are trained on.
-    config = replace(config, env=EnvChoice(config.env.name, dataset.metadata["options"]))
+    config = replace(config, env=EnvChoice(config.env.name, dataset.metadata.get("options", {})))
     folder = run_folder(config.output)
-    task = Task.from_dict(dataset.metadata["task"])
+    task = dataset.task
     check_memory(config.agent, task, config.size, usable_device(training.device))
     torch.manual_seed(training.seed)
     agent = build_agent(config.agent, task, config.size)

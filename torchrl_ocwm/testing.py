@@ -63,12 +63,11 @@ def random_records(task: Task, batch: int, time: int, *, seed: int = 0) -> Tenso
 
 def random_dataset(path: str | Path, task: Task, *, episodes: int = 4, length: int = 20) -> EpisodeDataset:
     """A dataset of random episodes of ``length`` records each."""
-    metadata = {"environment": task.name, "options": {}, "task": task.to_dict()}
-    dataset = EpisodeDataset.create(path, example=random_records(task, 1, 1)[0, 0], metadata=metadata)
-    for seed in range(episodes):
-        records = random_records(task, 1, length, seed=seed)[0]
-        records["action"][0] = 0
-        records["next", "done"][-1] = True
-        dataset.append(records)
-    dataset.trim()
+    metadata = {"environment": task.name, "options": task.options, "task": task.to_dict()}
+    with EpisodeDataset.create(path, example=random_records(task, 1, 1)[0, 0], metadata=metadata) as dataset:
+        for seed in range(episodes):
+            records = random_records(task, 1, length, seed=seed)[0]
+            records["action"][0] = 0
+            records["next", "done"][-1] = True
+            dataset.append(records)
     return dataset

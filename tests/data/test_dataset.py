@@ -3,6 +3,8 @@
 import errno
 import json
 import os
+import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +14,9 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
-from torchrl_ocwm.data import dataset as dataset_module
+from torchrl_ocwm.files import FolderInUseError
+
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 
 
 def episode(number: int, records: int = 4) -> TensorDict:
@@ -45,13 +49,16 @@ def assert_holds(dataset: EpisodeDataset, episodes: list[TensorDict]) -> None:
 
 @pytest.fixture
 def filled(tmp_path):
-    """A dataset of three episodes."""
+    """A dataset of three episodes, open for writing."""
     dataset = EpisodeDataset.create(tmp_path / "data", example=episode(0)[0], metadata={"environment": "none"})
     for number in range(3):
         dataset.append(episode(number, 4 + number))
-    return dataset
+    yield dataset
+    dataset.close()
 
 
+FRAME_BYTES = {"action": 8, "is_init": 1, "pixels": 48, "masks": 16, "proprio": 20}
+FILES = ("action", "is_init", "next/pixels", "next/masks", "next/proprio")
 THREE = [episode(number, 4 + number) for number in range(3)]
 
 
@@ -73,21 +80,36 @@ def test_path_may_be_a_string(filled):
 
 
 def test_opened_dataset_can_grow(filled):
-    again = EpisodeDataset.open(filled.path)
+    filled.close()
     more = [episode(number, 3 + number % 5) for number in range(10, 40)]
-    for records in more:
-        again.append(records)
+    with EpisodeDataset.open(filled.path, write=True) as again:
+        for records in more:
+            again.append(records)
+        assert_holds(again, THREE + more)
     assert_holds(again, THREE + more)
     assert_holds(EpisodeDataset.open(filled.path), THREE + more)
 
 
-def test_trim_gives_the_room_back(filled):
-    filled.append(episode(7, 9))
-    filled.trim()
-    assert (filled.path / "frames/next/pixels.memmap").stat().st_size == 24 * 3 * 4 * 4
-    assert_holds(EpisodeDataset.open(filled.path), [*THREE, episode(7, 9)])
-    filled.append(episode(8))
-    assert_holds(EpisodeDataset.open(filled.path), [*THREE, episode(7, 9), episode(8)])
+def test_files_are_as_long_as_the_records(filled):
+    assert (filled.path / "frames/next/pixels.memmap").stat().st_size == 15 * 3 * 4 * 4
+
+
+def test_episodes_by_number(filled):
+    assert len(filled) == 3
+    for number, expected in enumerate(THREE):
+        assert (filled[number] == expected).all()
+        assert (filled[number - 3] == expected).all()
+    assert [len(records) for records in filled] == [4, 5, 6]
+    with pytest.raises(IndexError):
+        filled[3]
+
+
+def test_an_episode_has_memory_of_its_own(filled):
+    first = filled[0]
+    first["action"].zero_()
+    filled[1]
+    assert not first["action"].any()
+    assert_holds(filled, THREE)
 
 
 def test_create_does_not_overwrite(filled):
@@ -114,19 +136,23 @@ def episode(number):
     return TensorDict({"action": steps, "is_init": torch.arange(length).unsqueeze(-1) == 0, "next": {"pixels": frames}},
         [length])
 
-def append_for_ever():
-    dataset = EpisodeDataset.open(path)
+def append_for_ever(appended):
+    dataset = EpisodeDataset.open(path, write=True)
     while True:
-        dataset.append(episode(len(dataset.episode_lengths)))
+        dataset.append(episode(len(dataset)))
+        os.write(appended, b".")
 
 dataset = EpisodeDataset.create(path, example=episode(0)[0])
 dataset.append(episode(0))
+dataset.close()
 random.seed(0)
 for _ in range(rounds):
+    reading, writing = os.pipe()
     child = os.fork()
     if not child:
-        append_for_ever()
-    time.sleep(random.uniform(0.02, 0.08))
+        append_for_ever(writing)
+    os.read(reading, 1)
+    time.sleep(random.uniform(0, 0.08))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     dataset = EpisodeDataset.open(path)
@@ -153,7 +179,7 @@ def test_stopped_between_frames_and_index(filled, monkeypatch, accident):
         raise accident
 
     with monkeypatch.context() as patch:
-        patch.setattr(dataset_module.os, "replace", stop)
+        patch.setattr(os, "replace", stop)
         with pytest.raises((KeyboardInterrupt, DatasetError)):
             filled.append(episode(9, 6))
     assert_holds(filled, THREE)
@@ -162,31 +188,22 @@ def test_stopped_between_frames_and_index(filled, monkeypatch, accident):
     assert_holds(EpisodeDataset.open(filled.path), [*THREE, episode(4)])
 
 
-def test_disk_full(filled, monkeypatch):
-    calls = []
-
-    def full(descriptor, offset, size):
-        calls.append(size)
-        if len(calls) == 3:  # the first files still fit
-            raise OSError(errno.ENOSPC, "No space left on device")
-        os.truncate(descriptor, size)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(dataset_module.os, "posix_fallocate", full, raising=False)
-        with pytest.raises(DatasetError, match=f"{filled.path}: cannot write .No space left on device"):
+def test_disk_full(filled):
+    """The system refuses to let a file grow, as it does on a full disk: after the first files have been written."""
+    resource = pytest.importorskip("resource")
+    handler, limits = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(DatasetError, match=f"{filled.path}: cannot write .File too large"):
             filled.append(episode(9, 50))
-    assert len(calls) == 3
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert (filled.path / "frames/action.memmap").stat().st_size > 15 * 8
     assert_holds(filled, THREE)
     assert_holds(EpisodeDataset.open(filled.path), THREE)
     filled.append(episode(4, 50))
     assert_holds(EpisodeDataset.open(filled.path), [*THREE, episode(4, 50)])
-
-
-def test_room_is_reserved_before_frames_are_written(filled):
-    """A sparse file would let the disk run full under the memory map, which kills the process."""
-    filled.append(episode(9, 2000))
-    status = (filled.path / "frames/next/pixels.memmap").stat()
-    assert status.st_blocks * 512 >= status.st_size >= 2000 * 48
 
 
 @pytest.mark.parametrize("inside", ["", "/more/folders"])
@@ -210,10 +227,223 @@ def test_dataset_that_has_become_read_only(filled, monkeypatch):
     def refuse(*arguments, **keywords):
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(dataset_module.os, "open", refuse)
-    with pytest.raises(DatasetError, match=f"{filled.path}: cannot write .Permission denied"):
-        filled.append(episode(9, 50))
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", refuse)
+        with pytest.raises(DatasetError, match=f"{filled.path}: cannot write .Permission denied"):
+            filled.append(episode(9, 50))
     assert_holds(filled, THREE)
+
+
+@linux
+def test_frames_reach_the_disk_before_the_index(filled, monkeypatch):
+    """The order of what the system is asked: all frames, the new index, its place, the folder that names it."""
+    log, fsync, replace = [], os.fsync, os.replace
+
+    def log_fsync(descriptor):
+        log.append(("sync", os.path.relpath(os.readlink(f"/proc/self/fd/{descriptor}"), filled.path)))
+        file = filled.path / log[-1][1]
+        if file.suffix == ".memmap":
+            assert file.stat().st_size == 21 * FRAME_BYTES[file.stem]  # all has been written by now
+        fsync(descriptor)
+
+    def log_replace(source, target):
+        log.append(("replace", os.path.relpath(target, filled.path)))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", log_fsync)
+    monkeypatch.setattr(os, "replace", log_replace)
+    filled.append(episode(9, 6))
+    frames, rest = log[:-3], log[-3:]
+    assert {name for _, name in frames} == {f"frames/{file}.memmap" for file in FILES}
+    assert {what for what, _ in frames} == {"sync"}
+    assert rest[0][0] == "sync"
+    assert rest[0][1].endswith(".json")
+    assert rest[1:] == [("replace", "dataset.json"), ("sync", ".")]
+
+
+@linux
+def test_a_new_dataset_and_its_files_reach_the_disk(tmp_path, monkeypatch):
+    synced, fsync = set(), os.fsync
+
+    def log_fsync(descriptor):
+        synced.add(os.path.relpath(os.readlink(f"/proc/self/fd/{descriptor}"), tmp_path))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", log_fsync)
+    EpisodeDataset.create(tmp_path / "data", example=episode(0)[0]).close()
+    assert synced >= {".", "data", "data/frames", "data/frames/next"}
+
+
+# Who may write.
+
+
+def on_disk(dataset: EpisodeDataset) -> dict[Path, bytes]:
+    return {file: file.read_bytes() for file in dataset.path.rglob("*") if file.is_file() and file.name[0] != "."}
+
+
+def test_read_only_unless_opened_to_write(filled):
+    filled.close()
+    before = on_disk(filled)
+    for dataset in (filled, EpisodeDataset.open(filled.path)):
+        for change in (lambda d: d.append(episode(9)), lambda d: d.annotate(note="new")):
+            message = rf"{filled.path}: is open to be read; EpisodeDataset\.open\(path, write=True\)"
+            with pytest.raises(DatasetError, match=message):
+                change(dataset)
+    assert on_disk(filled) == before
+
+
+@pytest.mark.parametrize("write", [False, True])
+def test_nothing_done_to_records_reaches_the_disk(filled, write):
+    filled.close()
+    before = on_disk(filled)
+    with EpisodeDataset.open(filled.path, write=write) as dataset:
+        records = dataset.records
+        records["next", "proprio"].mul_(0.1)
+        records[3:5]["action"].fill_(7)
+        records["next"]["pixels"][2] = 1
+        records[1] = episode(9)[0]
+        records.zero_()
+        with pytest.raises(RuntimeError, match="locked"):
+            records["action"] = torch.zeros(15, 2)
+    assert on_disk(filled) == before
+    assert_holds(EpisodeDataset.open(filled.path), THREE)
+
+
+def test_files_without_permission_to_write_can_be_read(filled):
+    for file in filled.path.rglob("*.memmap"):
+        file.chmod(0o444)
+    assert_holds(EpisodeDataset.open(filled.path), THREE)
+
+
+@pytest.mark.parametrize("write", [False, True])
+@pytest.mark.parametrize("linked", ["frames/action.memmap", "frames/next/pixels.memmap", "frames/next", "frames"])
+def test_links_are_refused(filled, tmp_path, linked, write):
+    filled.close()
+    (filled.path / linked).rename(tmp_path / "elsewhere")
+    (filled.path / linked).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(DatasetError, match=rf"{filled.path / linked}.*: is a link or no ordinary file"):
+        EpisodeDataset.open(filled.path, write=write)
+
+
+def test_the_folder_itself_may_be_a_link(filled, tmp_path):
+    (tmp_path / "link").symlink_to(filled.path)
+    assert_holds(EpisodeDataset.open(tmp_path / "link"), THREE)
+
+
+def test_pipes_are_refused_and_do_not_hang(filled):
+    (filled.path / "frames/action.memmap").unlink()
+    os.mkfifo(filled.path / "frames/action.memmap")
+    with pytest.raises(DatasetError, match=r"action\.memmap: is a link or no ordinary file"):
+        EpisodeDataset.open(filled.path)
+
+
+def test_second_writer_is_refused_and_readers_are_not(filled):
+    with pytest.raises(FolderInUseError, match=f"{filled.path}: process {os.getpid()} is writing here"):
+        EpisodeDataset.open(filled.path, write=True)
+    reader = EpisodeDataset.open(filled.path)
+    filled.append(episode(4))
+    assert_holds(reader, THREE)
+    assert_holds(EpisodeDataset.open(filled.path), [*THREE, episode(4)])
+
+
+HOLD = """
+import sys, time
+from torchrl_ocwm.data import EpisodeDataset
+
+dataset = EpisodeDataset.open(sys.argv[1], write=True)
+print("open", flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_writer_that_dies_gives_the_dataset_back(filled):
+    filled.close()
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(filled.path)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout.readline() == "open\n"
+        with pytest.raises(FolderInUseError, match=f"process {holder.pid} is writing here"):
+            EpisodeDataset.open(filled.path, write=True)
+        holder.kill()
+        holder.wait()
+    with EpisodeDataset.open(filled.path, write=True) as dataset:
+        dataset.append(episode(4))
+    assert_holds(EpisodeDataset.open(filled.path), [*THREE, episode(4)])
+
+
+def test_a_failed_opening_gives_the_dataset_back(filled):
+    filled.close()
+    write(filled.path, "next/proprio.memmap", 40, NAN)
+    with pytest.raises(DatasetError, match="holds NaN") as refused:
+        EpisodeDataset.open(filled.path, write=True)
+    with pytest.raises(DatasetError, match="holds NaN"):
+        EpisodeDataset.open(filled.path, write=True)
+    assert refused.value.__traceback__ is not None  # which keeps the first dataset alive
+
+
+@pytest.mark.parametrize("put_another_there", [False, True])
+def test_folder_that_is_moved_while_it_is_open(filled, tmp_path, put_another_there):
+    filled.path.rename(tmp_path / "moved")
+    if put_another_there:
+        EpisodeDataset.create(filled.path, example=episode(0)[0]).close()
+    before = sorted(tmp_path.rglob("*"))
+    for change in (lambda: filled.append(episode(9)), lambda: filled.annotate(note="new")):
+        with pytest.raises(DatasetError, match=f"{filled.path}: the folder was moved or replaced"):
+            change()
+    assert sorted(tmp_path.rglob("*")) == before
+    assert_holds(EpisodeDataset.open(tmp_path / "moved"), THREE)
+
+
+def test_file_that_is_lost_while_the_dataset_is_open(filled):
+    (filled.path / "frames/next/masks.memmap").unlink()
+    with pytest.raises(DatasetError, match=r"masks\.memmap: cannot be read .No such file"):
+        filled.append(episode(9))
+    assert not (filled.path / "frames/next/masks.memmap").exists()
+
+
+@pytest.mark.parametrize("lost", ["frames", "frames/next/pixels.memmap"])
+def test_killed_between_index_and_files(tmp_path, lost):
+    """Of a new dataset: the next writer makes what is missing."""
+    EpisodeDataset.create(tmp_path / "data", example=episode(0)[0]).close()
+    path = tmp_path / "data" / lost
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    with EpisodeDataset.open(tmp_path / "data", write=True) as dataset:
+        dataset.append(episode(5))
+    assert_holds(EpisodeDataset.open(tmp_path / "data"), [episode(5)])
+
+
+def test_frames_without_an_index_are_not_written_over(filled):
+    filled.close()
+    (filled.path / "dataset.json").unlink()
+    before = on_disk(filled)
+    with pytest.raises(DatasetError, match=r"memmap: frames of a dataset without dataset\.json; move them away"):
+        EpisodeDataset.create(filled.path, example=episode(0)[0])
+    assert on_disk(filled) == before
+
+
+# Checksums.
+
+
+@pytest.mark.parametrize("file", ["action", "is_init", "next/pixels", "next/masks", "next/proprio"])
+def test_a_changed_frame_is_found(filled, file):
+    filled.close()
+    filled.verify()
+    EpisodeDataset.open(filled.path, verify=True)
+    size = (filled.path / f"frames/{file}.memmap").stat().st_size
+    content = (filled.path / f"frames/{file}.memmap").read_bytes()
+    place = size * 6 // 15 + 3 if size > 15 else 5  # in the second episode, not its first record
+    write(filled.path, f"{file}.memmap", place, bytes([content[place] ^ 1]))
+    message = rf"{filled.path}/frames: the frames of episodes \[1\] are not those that were stored"
+    with pytest.raises(DatasetError, match=message):
+        filled.verify()
+    with pytest.raises(DatasetError, match="episodes do not start" if file == "is_init" else message):
+        EpisodeDataset.open(filled.path, verify=True)
+
+
+def test_without_checksums(tmp_path):
+    with EpisodeDataset.create(tmp_path / "data", example=episode(0)[0], checksums=False) as dataset:
+        dataset.append(episode(0))
+    assert "checksums" not in dataset.metadata
+    with pytest.raises(DatasetError, match=r"dataset\.json: was made without checksums"):
+        EpisodeDataset.open(tmp_path / "data", verify=True)
 
 
 # Episodes that do not fit.
@@ -311,7 +541,10 @@ NAN = b"\x00\x00\xc0\x7f"
         (lambda p: (p / "dataset.json").write_text("[1, 2]"), r"dataset\.json: not an index of"),
         (lambda p: change_index(p, version=99), r"dataset\.json: version 99, this release reads version 1"),
         (lambda p: drop_from_index(p, "keys"), r"dataset\.json: lacks \['keys'\]; the dataset is corrupt"),
-        (lambda p: change_index(p, records=0, episode_lengths=[]), r"dataset\.json: no episode has been stored yet"),
+        (
+            lambda p: change_index(p, records=0, episode_lengths=[], checksums=[]),
+            r"dataset\.json: no episode has been stored yet",
+        ),
         (lambda p: change_index(p, episode_lengths=[4, 5]), r"dataset\.json: episode lengths do not add up"),
         (lambda p: change_index(p, episode_lengths=[5, 4, 6]), r"is_init\.memmap: episodes do not start where"),
         (lambda p: write(p, "is_init.memmap", 2, b"\x01"), r"is_init\.memmap: episodes do not start where"),
@@ -322,7 +555,6 @@ NAN = b"\x00\x00\xc0\x7f"
     ],
 )
 def test_open_names_the_file_and_the_reason(filled, damage, message):
-    filled.trim()
     damage(filled.path)
     with pytest.raises(DatasetError, match=message) as caught:
         EpisodeDataset.open(filled.path)
@@ -355,10 +587,10 @@ def test_file_in_place_of_a_folder(tmp_path):
 
 
 def test_empty_dataset_can_be_continued(tmp_path):
-    EpisodeDataset.create(tmp_path / "data", example=episode(0)[0])
+    EpisodeDataset.create(tmp_path / "data", example=episode(0)[0]).close()
     with pytest.raises(DatasetError, match="no episode has been stored yet; collect some first"):
         EpisodeDataset.open(tmp_path / "data")
-    dataset = EpisodeDataset.open(tmp_path / "data", allow_empty=True)
+    dataset = EpisodeDataset.open(tmp_path / "data", write=True)
     assert dataset.num_steps == 0
     dataset.append(episode(5))
     assert_holds(EpisodeDataset.open(tmp_path / "data"), [episode(5)])

@@ -80,7 +80,10 @@ def test_writing_and_sampling_keep_memory_flat(tmp_path):
         dataset.append(records)
         most = max(most, resident() - before)
     assert most < 12
+    dataset.close()
 
+    for file in dataset.path.rglob("*.memmap"):
+        file.chmod(0o444)
     dataset = EpisodeDataset.open(dataset.path)
     buffer = make_replay_buffer(dataset, batch_size=8, slice_len=20)
     buffer.sample()

@@ -68,5 +68,5 @@ def test_uniform_goals_fill_the_workspace():
 
 
 def test_unknown_kind_of_goals():
-    with pytest.raises(ValueError, match="goals must be 'uniform' or 'stored', got 'hindsight'"):
+    with pytest.raises(ValueError, match="goals must be 'auto', 'uniform' or 'stored', got 'hindsight'"):
         RelabelGoals(WORKSPACE, goals="hindsight")

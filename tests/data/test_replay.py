@@ -1,5 +1,7 @@
 """From a collector over the disk to the sampled sequences: every step follows the one before."""
 
+import warnings
+
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -120,16 +122,57 @@ def test_every_place_is_sampled(dataset):
 
 
 def test_slices_may_be_as_long_as_the_shortest_episode(dataset):
-    batch = sample(dataset, slice_len=6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        batch = sample(dataset, slice_len=6)
     assert torch.equal(
         batch["next", "count"].squeeze(-1) - batch["next", "count"][:, 0], torch.arange(6.0).expand(50, 6)
     )
 
 
-def test_slices_longer_than_the_shortest_episode(dataset):
-    message = f"{dataset.path}: cannot cut sequences of 7 frames, the shortest episode has 6; .*collect longer episodes"
+def test_episodes_shorter_than_a_slice_are_skipped(dataset):
+    with pytest.warns(UserWarning, match=f"{dataset.path}: 4 of 8 episodes are shorter than 8 frames and are skipped"):
+        batch = sample(dataset, batches=20, slice_len=8)
+    assert batch.batch_size == (1000, 8)
+    assert set(batch["next", "episode"].flatten().tolist()) == {1, 3, 5, 7}
+
+
+def test_slices_longer_than_all_episodes(dataset):
+    message = f"{dataset.path}: cannot cut sequences of 15 frames, the longest episode has 14; .*collect longer"
     with pytest.raises(DatasetError, match=message):
-        make_replay_buffer(dataset, batch_size=2, slice_len=7)
+        make_replay_buffer(dataset, batch_size=2, slice_len=15)
+
+
+# The buffer is to be read.
+
+
+def new_records() -> TensorDict:
+    frames = {key: torch.full((4, 1), 99.0) for key in ("count", "episode", "taken", "object_position_true", "reward")}
+    ends = {key: torch.zeros(4, 1, dtype=torch.bool) for key in ("done", "terminated")}
+    is_init = torch.arange(4).unsqueeze(-1) == 0
+    return TensorDict({"action": torch.full((4, 1), 99.0), "is_init": is_init, "next": {**frames, **ends}}, [4])
+
+
+WRITES = {
+    "extend": lambda buffer: buffer.extend(new_records()),
+    "add": lambda buffer: buffer.add(new_records()[0]),
+    "set": lambda buffer: buffer.__setitem__(0, new_records()[0]),
+    "set many": lambda buffer: buffer.__setitem__(slice(0, 4), new_records()),
+    "empty": lambda buffer: buffer.empty(),
+    "load": lambda buffer: buffer.load_state_dict(buffer.state_dict()),
+}
+
+
+@pytest.mark.parametrize("write", WRITES.values(), ids=WRITES.keys())
+def test_buffer_refuses_to_be_written_and_says_how_to_add_episodes(dataset, write):
+    buffer = make_replay_buffer(dataset, batch_size=2, slice_len=SLICE, exclude=())
+    before = {file: file.read_bytes() for file in dataset.path.rglob("*.memmap")}
+    message = rf"{dataset.path}: this buffer only samples; add episodes with EpisodeDataset\.open\(path, write=True\)"
+    with pytest.raises(RuntimeError, match=message):
+        write(buffer)
+    assert {file: file.read_bytes() for file in dataset.path.rglob("*.memmap")} == before
+    assert len(buffer) == len(dataset.records)
+    assert buffer.sample()["next", "count"].max() < 99
 
 
 def test_seed_repeats_the_samples(dataset):

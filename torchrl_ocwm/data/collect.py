@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections import Counter
 from collections.abc import Callable, Generator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
 from itertools import count, cycle
 from pathlib import Path
@@ -106,23 +106,25 @@ def collect(
     name, module = make_policy(settings.policy if policy is None else policy, task)
     dataset = _open_if_there(Path(path), source)
     if dataset is not None and dataset.num_steps >= settings.steps:
-        return _with_coverage(dataset, task)
+        with dataset:
+            return _with_coverage(dataset, task)
     done = dataset.num_steps if dataset is not None else 0
 
     make_player = partial(EpisodePlayer, partial(make_env, environment, **options), module, settings.seed)
     played = play_in_order(make_player, settings, first=_next_number(dataset))
     bar = tqdm(total=settings.steps, initial=done, unit="step", desc=f"collect {environment}", disable=not progress)
-    with bar, closing(played) as episodes:
+    with bar, ExitStack() as writing, closing(played) as episodes:
+        if dataset is not None:
+            writing.enter_context(dataset)
         for records, failures in episodes:
             if dataset is None:
-                dataset = EpisodeDataset.create(path, example=records[0], metadata=source)
+                dataset = writing.enter_context(EpisodeDataset.create(path, example=records[0], metadata=source))
             dataset.append(records, **_count(dataset, name, failures), coverage=None)
             bar.update(len(records) - 1)
             if dataset.num_steps >= settings.steps:
                 break
-    assert dataset is not None
-    dataset.trim()
-    return _with_coverage(dataset, task)
+        assert dataset is not None
+        return _with_coverage(dataset, task)
 
 
 def make_policy(policy: str | Path | TensorDictModuleBase, task: Task) -> tuple[str, TensorDictModuleBase]:
@@ -257,9 +259,10 @@ def _with_coverage(dataset: EpisodeDataset, task: Task) -> EpisodeDataset:
 def _open_if_there(path: Path, source: dict[str, Any]) -> EpisodeDataset | None:
     if not (path / "dataset.json").exists():
         return None
-    dataset = EpisodeDataset.open(path, allow_empty=True)  # it may have been killed before the first episode
+    dataset = EpisodeDataset.open(path, write=True)  # it may have been killed before the first episode
     there = {key: dataset.metadata.get(key) for key in source}
     if there != json.loads(json.dumps(source)):
+        dataset.close()
         raise DatasetError(
             f"{path}: holds a dataset of {there['environment']!r} with options {there['options']}, not of "
             f"{source['environment']!r} with {source['options']}; choose another folder"

@@ -4,105 +4,154 @@ from __future__ import annotations
 
 import json
 import os
+import stat
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from math import prod
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import torch
-from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
-from torchrl_ocwm.data.memory import release_pages
+from torchrl_ocwm.data.contract import DatasetError, check_values, conform
+from torchrl_ocwm.data.index import (
+    DTYPES,
+    FORMAT,
+    INDEX,
+    VERSION,
+    check_fields,
+    check_index,
+    describe,
+    read_index,
+    to_json,
+)
+from torchrl_ocwm.data.memory import map_privately, release_pages
+from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.files import only_writer, replacing, sync
 
-FORMAT, VERSION = "torchrl_ocwm dataset", 1
-_INDEX = "dataset.json"
 _FRAMES = "frames"
-_GROWTH = 0.25
-
-
-class DatasetError(ValueError):
-    """A dataset cannot be read or written; the message names the file and the reason."""
 
 
 class EpisodeDataset:
     """Whole episodes in memory-mapped files, as records (:func:`~torchrl_ocwm.data.episode_to_records`).
 
-    A folder with ``frames/``, one memory-mapped file per key, and ``dataset.json``, the index: how many records count,
-    their keys, shapes and dtypes, and where they come from. An episode is written behind the last one that counts, and
-    then the index is replaced in one step, so that the folder holds whole episodes at any moment. Memory stays flat:
-    pages are handed back to the system (:func:`~torchrl_ocwm.data.release_pages`).
+    A folder with ``frames/``, one file per key, and ``dataset.json``, the index: how many records count, their keys,
+    shapes and dtypes, and where they come from. An episode is written behind the last one that counts, and when it has
+    reached the disk the index is replaced in one step, so that the folder holds whole episodes at any moment, also
+    after a power cut. Memory stays flat: pages are handed back to the system
+    (:func:`~torchrl_ocwm.data.release_pages`).
 
-    Open a dataset with :meth:`open`, start one with :meth:`create`.
+    Start a dataset with :meth:`create`, open one with :meth:`open`. Only one that is open for writing can grow, and
+    only one process at a time can have it so, until :meth:`close` or the end of a ``with`` block. Any number may read.
 
     Examples:
         >>> import tempfile
         >>> records = TensorDict({"action": torch.zeros(3, 2), "is_init": torch.tensor([[True], [False], [False]]),
         ...     "next": {"observation": torch.rand(3, 4)}}, [3])
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     dataset = EpisodeDataset.create(folder + "/data", example=records[0])
-        ...     dataset.append(records)
+        ...     with EpisodeDataset.create(folder + "/data", example=records[0]) as dataset:
+        ...         dataset.append(records)
         ...     EpisodeDataset.open(folder + "/data").records["next", "observation"].shape
         torch.Size([3, 4])
     """
 
     def __init__(self, path: Path, index: dict[str, Any]) -> None:
         self.path, self._index = path, index
-        self._frames = self._map()
+        self._records: TensorDictBase | None = None
+        self._writing: ExitStack | None = None
 
     @classmethod
     def create(
-        cls, path: str | Path, *, example: TensorDictBase, metadata: dict[str, Any] | None = None
+        cls,
+        path: str | Path,
+        *,
+        example: TensorDictBase,
+        metadata: dict[str, Any] | None = None,
+        checksums: bool = True,
     ) -> EpisodeDataset:
-        """Start an empty dataset.
+        """Start an empty dataset, open for writing.
 
         Args:
             path: Folder to make.
             example: One record, batch size ``[]``, which gives keys, shapes and dtypes.
-            metadata: What else to keep in the index, such as the environment; must fit in JSON.
+            metadata: What else to keep in the index, such as the environment; must fit in JSON. With a ``task``
+                (:meth:`~torchrl_ocwm.envs.Task.to_dict`) come its ``environment`` and its ``options``, and records must
+                be as the data contract says (docs/data.md). They are converted if that loses nothing.
+            checksums: Keep a checksum of each episode, for :meth:`verify`.
 
         Raises:
-            DatasetError: if there is a dataset already, or the folder cannot be written.
+            DatasetError: if there is a dataset already, the folder cannot be written, or example and metadata are not
+                those of a dataset.
+            FolderInUseError: if another process writes there.
         """
         path = Path(path)
-        if (path / _INDEX).exists():
-            raise DatasetError(f"{path / _INDEX}: there is a dataset here already; open it, or choose another folder")
-        index = {
-            "format": FORMAT,
-            "version": VERSION,
-            "records": 0,
-            "episode_lengths": [],
-            "keys": _describe(example),
-            **(metadata or {}),
-        }
-        try:
-            (path / _FRAMES).mkdir(parents=True, exist_ok=True)
-            dataset = cls(path, index)
-            dataset._commit(index)
-        except OSError as error:
-            raise DatasetError(f"{path}: cannot write a dataset here ({error.strerror or error})") from error
+        index = {**(metadata or {}), "format": FORMAT, "version": VERSION, "records": 0, "episode_lengths": []}
+        if checksums:
+            index["checksums"] = []
+        dataset = cls(path, json.loads(to_json({**index, "keys": describe(example)})))
+        check_fields(dataset._index)
+        dataset._index["keys"] = describe(dataset._conform(example))
+        with dataset._named_failures("write a dataset here"):
+            _refuse_another(path)
+            path.mkdir(parents=True, exist_ok=True)
+            dataset._start_writing()
+            try:
+                _refuse_another(path)  # which was made meanwhile
+                dataset._commit(dataset._index)
+                dataset._make_files()
+            except BaseException:
+                dataset.close()
+                raise
         return dataset
 
     @classmethod
-    def open(cls, path: str | Path, *, allow_empty: bool = False) -> EpisodeDataset:
+    def open(cls, path: str | Path, *, write: bool = False, verify: bool = False) -> EpisodeDataset:
         """Open a dataset, after checking that its files are whole and belong together.
 
         Args:
             path: Its folder.
-            allow_empty: Also open one in which no episode has been stored yet, to add some.
+            write: Also to add episodes. It may then be one in which no episode has been stored yet.
+            verify: Also compare all frames with their checksums (:meth:`verify`), which reads all of them.
 
         Raises:
             DatasetError: if the folder holds no dataset, a foreign, truncated, empty or corrupt one.
+            FolderInUseError: if it is to be written and another process does so already.
         """
         path = Path(path)
-        index = _read_index(path)
-        if not index["records"]:
-            if not allow_empty:
-                raise DatasetError(f"{path / _INDEX}: no episode has been stored yet; collect some first")
-            return cls(path, index)
-        for name, (shape, dtype) in index["keys"].items():
-            _check_size(path / _FRAMES / f"{name}.memmap", torch.Size([index["records"], *shape]), _dtype(dtype))
-        dataset = cls(path, index)
-        dataset._check_episodes()
-        release_pages(dataset._frames)
+        dataset = cls(path, read_index(path))
+        try:
+            if write:
+                dataset._prepare_writing()
+            elif not dataset._index["records"]:
+                raise DatasetError(f"{path / INDEX}: no episode has been stored yet; collect some first")
+            dataset._check_files()
+            if dataset._index["records"]:
+                dataset._check_content()
+            if verify:
+                dataset.verify()
+        except BaseException:
+            dataset.close()
+            raise
         return dataset
+
+    def close(self) -> None:
+        """End writing, so that another process may. The dataset can still be read."""
+        if self._writing is not None:
+            self._writing.close()
+        self._writing = None
+
+    def __enter__(self) -> EpisodeDataset:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -110,9 +159,31 @@ class EpisodeDataset:
         return self._index
 
     @property
+    def task(self) -> Task:
+        """The task of the index.
+
+        Raises:
+            DatasetError: if it holds none.
+        """
+        if "task" not in self._index:
+            raise DatasetError(f"{self.path / INDEX}: holds no task; give one in the metadata at EpisodeDataset.create")
+        return Task.from_dict(self._index["task"])
+
+    @property
+    def images_show_goal(self) -> bool:
+        """Whether the goal of an episode is drawn into its images (the environments' option ``virtual_target``)."""
+        return bool(self._index.get("options", {}).get("virtual_target"))
+
+    @property
     def records(self) -> TensorDictBase:
-        """``[N]`` records of all episodes, one after the other, memory-mapped."""
-        return self._frames[: self._index["records"]]
+        """``[N]`` records of all episodes, one after the other, memory-mapped to be read.
+
+        What is changed in them in place never reaches the disk, and is forgotten when their pages are handed back to
+        the system. Change a clone.
+        """
+        if self._records is None or len(self._records) != self._index["records"]:
+            self._records = self._map().lock_()
+        return self._records
 
     @property
     def episode_lengths(self) -> list[int]:
@@ -130,24 +201,59 @@ class EpisodeDataset:
         lengths = torch.tensor(self.episode_lengths, dtype=torch.long)
         return torch.arange(len(lengths)).repeat_interleave(lengths)
 
+    def __len__(self) -> int:
+        """Number of episodes."""
+        return len(self.episode_lengths)
+
+    def __getitem__(self, episode: int) -> TensorDictBase:
+        """Records ``[T + 1]`` of an episode, in memory of their own."""
+        number = range(len(self))[episode]
+        start = sum(self.episode_lengths[:number])
+        records = self.records[start : start + self.episode_lengths[number]].clone()
+        release_pages(self.records)
+        return records
+
+    def long_enough(self, length: int) -> list[int]:
+        """The episodes that sequences of ``length`` records can be cut from; warns of those that are too short.
+
+        Raises:
+            DatasetError: if there is none.
+        """
+        fitting = [number for number, records in enumerate(self.episode_lengths) if records >= length]
+        if not fitting:
+            raise DatasetError(
+                f"{self.path}: cannot cut sequences of {length} frames, the longest episode has "
+                f"{max(self.episode_lengths, default=0)}; choose shorter sequences or collect longer episodes"
+            )
+        if len(fitting) < len(self):
+            warnings.warn(
+                f"{self.path}: {len(self) - len(fitting)} of {len(self)} episodes are shorter than {length} frames "
+                "and are skipped",
+                stacklevel=3,
+            )
+        return fitting
+
     def append(self, records: TensorDictBase, **metadata: Any) -> None:
         """Add the records ``[T + 1]`` of one episode, and in the same moment change ``metadata`` of the index.
 
         Raises:
             DatasetError: if the episode does not start with ``is_init``, holds NaN or infinity, has other keys, shapes
-                or dtypes than the dataset, or the disk is full. The dataset stays as it was.
+                or dtypes than the dataset, or is not as the data contract says; if the dataset is not open for
+                writing, its folder was moved, or the disk is full. The dataset stays as it was.
         """
-        self._check_new(records)
-        start, end = self._index["records"], self._index["records"] + len(records)
-        try:
-            if end > len(self._frames):
-                self._resize(end + int(_GROWTH * start))
-            self._frames[start:end] = records
-            lengths = [*self.episode_lengths, len(records)]
-            self._commit({**self._index, **metadata, "records": end, "episode_lengths": lengths})
-        except OSError as error:
-            raise DatasetError(f"{self.path}: cannot write ({error.strerror or error})") from error
-        release_pages(self._frames)
+        self._check_writing()
+        records = self._check_new(records)
+        start, checksum = self._index["records"], 0
+        with self._named_failures("write"):
+            self._check_files()
+            for name, (file, shape, dtype) in self._files().items():
+                frames = _bytes(records[tuple(name.split("/"))])
+                _write(file, start * prod(shape) * dtype.itemsize, frames)
+                checksum = zlib.crc32(frames, checksum)
+            changes = {"records": start + len(records), "episode_lengths": [*self.episode_lengths, len(records)]}
+            if "checksums" in self._index:
+                changes["checksums"] = [*self._index["checksums"], checksum]
+            self._commit({**self._index, **metadata, **changes})
 
     def annotate(self, **metadata: Any) -> None:
         """Keep something else in the index; must fit in JSON.
@@ -155,61 +261,114 @@ class EpisodeDataset:
         Raises:
             DatasetError: if it cannot be written.
         """
-        try:
+        self._check_writing()
+        with self._named_failures("write"):
             self._commit({**self._index, **metadata})
-        except OSError as error:
-            raise DatasetError(f"{self.path}: cannot write ({error.strerror or error})") from error
 
-    def trim(self) -> None:
-        """Give back the room that was kept for more episodes."""
-        self._resize(self._index["records"])
+    def verify(self) -> None:
+        """Compare all frames with the checksums that were stored with them.
 
-    def _files(self) -> dict[str, tuple[Path, torch.Size, torch.dtype]]:
+        Raises:
+            DatasetError: naming the episodes that have changed, or if there are no checksums.
+        """
+        if "checksums" not in self._index:
+            raise DatasetError(f"{self.path / INDEX}: was made without checksums; its frames cannot be verified")
+        changed = [number for number, checksum in enumerate(self._index["checksums"]) if self._sum(number) != checksum]
+        if changed:
+            raise DatasetError(
+                f"{self.path / _FRAMES}: the frames of episodes {changed} are not those that were stored; copy or "
+                "collect them again"
+            )
+
+    def _sum(self, episode: int) -> int:
+        checksum, records = 0, self[episode]
+        for name in self._index["keys"]:
+            checksum = zlib.crc32(_bytes(records[tuple(name.split("/"))]), checksum)
+        return checksum
+
+    # Files.
+
+    def _files(self) -> dict[str, tuple[Path, list[int], torch.dtype]]:
         return {
-            name: (self.path / _FRAMES / f"{name}.memmap", torch.Size(shape), _dtype(dtype))
+            name: (self.path / _FRAMES / f"{name}.memmap", shape, DTYPES[dtype])
             for name, (shape, dtype) in self._index["keys"].items()
         }
 
-    def _map(self) -> TensorDictBase:
-        files = self._files()
-        capacity = min(
-            file.stat().st_size // (shape.numel() * dtype.itemsize) if file.exists() else 0
-            for file, shape, dtype in files.values()
-        )
-        if not capacity:
-            return TensorDict({}, [0])
-        return TensorDict(
-            {
-                tuple(name.split("/")): MemoryMappedTensor.from_filename(file, dtype, torch.Size([capacity, *shape]))
-                for name, (file, shape, dtype) in files.items()
-            },
-            [capacity],
-        )
-
-    def _resize(self, capacity: int) -> None:
-        for file, shape, dtype in self._files().values():
+    def _make_files(self) -> None:
+        for file, _, _ in self._files().values():
             file.parent.mkdir(parents=True, exist_ok=True)
-            size = capacity * shape.numel() * dtype.itemsize
-            descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
-            try:
-                # Reserve the room now: a disk that fills up under a memory map kills the process.
-                if hasattr(os, "posix_fallocate") and size > os.fstat(descriptor).st_size:
-                    os.posix_fallocate(descriptor, 0, size)
-                os.ftruncate(descriptor, size)
-            finally:
-                os.close(descriptor)
-        self._frames = self._map()
+            file.touch()
+        for folder in {file.parent for file, _, _ in self._files().values()} | {self.path, self.path.parent}:
+            sync(folder)
+
+    def _check_files(self) -> None:
+        """Every file of the index is there, a file of this folder, and long enough; there is no other."""
+        files = self._files()
+        for file, shape, dtype in files.values():
+            _check_file(file, self.path, self._index["records"] * prod(shape) * dtype.itemsize)
+        unknown = {*(self.path / _FRAMES).rglob("*.memmap")} - {file for file, _, _ in files.values()}
+        if unknown:
+            raise DatasetError(f"{min(unknown)}: {INDEX} does not know this file; they belong to different datasets")
+
+    def _map(self) -> TensorDictBase:
+        """Private maps: nothing that is written to them reaches the files."""
+        records = self._index["records"]
+        frames: TensorDictBase = TensorDict({}, [records])
+        for name, (file, shape, dtype) in self._files().items() if records else ():
+            frames[tuple(name.split("/"))] = map_privately(file, (records, *shape), dtype)
+        return frames
+
+    # Writing.
+
+    def _prepare_writing(self) -> None:
+        with self._named_failures("write"):
+            self._start_writing()
+            self._index = read_index(self.path)  # as the writer before has left it
+            if not self._index["records"]:
+                self._make_files()  # it may have been killed before
+
+    def _start_writing(self) -> None:
+        with ExitStack() as stack:
+            stack.enter_context(only_writer(self.path))
+            self._folder = self.path.stat()
+            self._writing = stack.pop_all()
+
+    def _check_writing(self) -> None:
+        if self._writing is None:
+            raise DatasetError(
+                f"{self.path}: is open to be read; EpisodeDataset.open(path, write=True) opens it to add episodes"
+            )
+        if not self.path.exists() or not os.path.samestat(self.path.stat(), self._folder):
+            raise DatasetError(f"{self.path}: the folder was moved or replaced while it was open for writing")
 
     def _commit(self, index: dict[str, Any]) -> None:
-        draft = self.path / f".{_INDEX}.{os.getpid()}"
-        draft.write_text(json.dumps(index) + "\n")
-        os.replace(draft, self.path / _INDEX)
+        text = to_json(index)
+        index = json.loads(text)
+        check_index(index)
+        with replacing(self.path / INDEX) as draft:
+            draft.write_text(text + "\n", encoding="utf-8")
         self._index = index
 
-    def _check_new(self, records: TensorDictBase) -> None:
+    @contextmanager
+    def _named_failures(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise DatasetError(f"{self.path}: cannot {what} ({error.strerror or error})") from error
+
+    # What is in the records.
+
+    def _conform(self, records: TensorDictBase) -> TensorDictBase:
+        """Records as the task's contract has them; any records if there is no task."""
+        if "task" not in self._index:
+            return records
+        return conform(records, Task.from_dict(self._index["task"]), f"{self.path}: ")
+
+    def _check_new(self, records: TensorDictBase) -> TensorDictBase:
         if not len(records):
             raise DatasetError("an episode without records cannot be stored")
-        keys = _describe(records[0])
+        records = self._conform(records)
+        keys = describe(records[0])
         if keys != self._index["keys"]:
             expected = self._index["keys"]
             odd = [name for name in {**keys, **expected} if keys.get(name) != expected.get(name)]
@@ -221,31 +380,58 @@ class EpisodeDataset:
         bad = _not_finite(records)
         if bad is not None:
             raise DatasetError(f"NaN or infinity in {bad!r} of an episode; it was not stored")
+        if "task" in self._index:
+            check_values(records, [len(records)], self.task, f"{self.path}: ")
+        return records
 
-    def _check_episodes(self) -> None:
+    def _check_content(self) -> None:
         starts = torch.tensor([0, *self.episode_lengths]).cumsum(0)
-        if starts[-1] != self._index["records"]:
-            raise DatasetError(f"{self.path / _INDEX}: episode lengths do not add up to the number of records")
         inits = self.records["is_init"].flatten().nonzero().flatten()
         if not torch.equal(inits, starts[:-1]):
             raise DatasetError(
-                f"{self.path / _FRAMES / 'is_init.memmap'}: episodes do not start where {_INDEX} says; the files are "
+                f"{self.path / _FRAMES / 'is_init.memmap'}: episodes do not start where {INDEX} says; the files are "
                 "corrupt or belong to different datasets"
             )
         bad = _not_finite(self.records)
         if bad is not None:
             raise DatasetError(f"{self.path / _FRAMES / bad}.memmap: holds NaN or infinity; the dataset is corrupt")
+        if "task" in self._index:
+            check_values(self.records, self.episode_lengths, self.task, f"{self.path / _FRAMES}/")
+        release_pages(self.records)
 
 
-def _describe(record: TensorDictBase) -> dict[str, list[Any]]:
-    return {
-        name: [[*value.shape], str(value.dtype).removeprefix("torch.")]
-        for name, value in sorted(record.flatten_keys("/").items())
-    }
+def _refuse_another(path: Path) -> None:
+    if (path / INDEX).exists():
+        raise DatasetError(f"{path / INDEX}: there is a dataset here already; open it, or choose another folder")
+    left = next((path / _FRAMES).rglob("*.memmap"), None)
+    if left is not None:
+        raise DatasetError(f"{left}: frames of a dataset without {INDEX}; move them away, or choose another folder")
 
 
-def _dtype(name: str) -> torch.dtype:
-    return getattr(torch, name)
+def _check_file(file: Path, folder: Path, needed: int) -> None:
+    """A file that is not there, too short, or a link to somewhere else is not mapped or written to."""
+    try:
+        status = file.lstat()
+    except OSError as error:
+        raise DatasetError(f"{file}: cannot be read ({error.strerror}); the dataset is corrupt") from error
+    inside = file.relative_to(folder).parents
+    if not stat.S_ISREG(status.st_mode) or any((folder / part).is_symlink() for part in inside if part.name):
+        raise DatasetError(f"{file}: is a link or no ordinary file; put the file itself there")
+    if status.st_size < needed:
+        raise DatasetError(f"{file}: {status.st_size} bytes, should be at least {needed}; the file was truncated")
+
+
+def _write(file: Path, offset: int, frames: memoryview) -> None:
+    """Write frames into a file and wait until they are on the disk."""
+    with file.open("r+b") as stream:
+        stream.seek(offset)
+        stream.write(frames)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _bytes(frames: Tensor) -> memoryview:
+    return memoryview(frames.detach().cpu().contiguous().flatten().view(torch.uint8).numpy())
 
 
 def _not_finite(records: TensorDictBase) -> str | None:
@@ -253,34 +439,3 @@ def _not_finite(records: TensorDictBase) -> str | None:
         if value.is_floating_point() and not value.isfinite().all():
             return name
     return None
-
-
-def _read_index(path: Path) -> dict[str, Any]:
-    file = path / _INDEX
-    try:
-        index = json.loads(file.read_text())
-    except FileNotFoundError:
-        raise DatasetError(f"{file}: no such file; {path} holds no dataset of torchrl_ocwm") from None
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be read ({error.strerror or error})") from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DatasetError(f"{file}: not JSON ({error}); the dataset is corrupt") from error
-    if not isinstance(index, dict) or index.get("format") != FORMAT:
-        raise DatasetError(f"{file}: not an index of a torchrl_ocwm dataset")
-    if index.get("version") != VERSION:
-        raise DatasetError(f"{file}: version {index.get('version')}, this release reads version {VERSION}")
-    missing = {"records", "episode_lengths", "keys"} - set(index)
-    if missing:
-        raise DatasetError(f"{file}: lacks {sorted(missing)}; the dataset is corrupt")
-    return index
-
-
-def _check_size(file: Path, shape: torch.Size, dtype: torch.dtype) -> None:
-    """A file that is too short would be lengthened with zeros when it is mapped, so its size is checked before."""
-    try:
-        size = file.stat().st_size
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be read ({error.strerror}); the dataset is corrupt") from error
-    needed = shape.numel() * dtype.itemsize
-    if size < needed:
-        raise DatasetError(f"{file}: {size} bytes, should be at least {needed}; the file was truncated")

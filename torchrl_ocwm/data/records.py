@@ -23,7 +23,8 @@ def episode_to_records(episode: TensorDictBase) -> TensorDictBase:
         ``[T + 1]`` records.
 
     Raises:
-        ValueError: for an empty episode, or one that does not end exactly at its last step.
+        ValueError: for an empty episode, one that does not end exactly at its last step, and one whose first frame is
+            not at the root, with the shapes and dtypes of the others.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -46,9 +47,27 @@ def episode_to_records(episode: TensorDictBase) -> TensorDictBase:
     steps["next"] = episode["next"].exclude("is_init")
     first = steps[:1].clone().zero_()
     first["is_init"].fill_(True)
-    seen = [key for key in steps["next"].keys(True, True) if key in episode.keys(True) and key not in _ENDS]
-    first["next"].update_(episode[:1].select(*seen))
+    first["next"].update_(_first_frame(episode, steps["next"]))
     return torch.cat([first, steps])
 
 
-_ENDS = ("done", "terminated", "truncated")
+_EARNED = ("reward", "done", "terminated", "truncated")
+
+
+def _first_frame(episode: TensorDictBase, frames: TensorDictBase) -> TensorDictBase:
+    """The frame ``[1]`` at the root of the first step, which has all that the later frames have."""
+    seen = [key for key in frames.keys(True, True) if key not in _EARNED]
+    missing = [key for key in seen if key not in episode.keys(True)]
+    if missing:
+        raise ValueError(
+            f"the episode has {missing} under 'next' only, so that its first frame lacks them; put the frame that each "
+            "action was chosen on at the root, as a rollout does, or exclude these keys"
+        )
+    for key in seen:
+        here, there = episode[key], frames[key]
+        if here.shape != there.shape or here.dtype != there.dtype:
+            raise ValueError(
+                f"{key!r} is {here.dtype} {(*here.shape,)} at the root and {there.dtype} {(*there.shape,)} under "
+                "'next'; both are frames of one recording"
+            )
+    return episode[:1].select(*seen)

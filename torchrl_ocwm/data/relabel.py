@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import Transform
 
+from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
 from torchrl_ocwm.envs.workspace import Workspace
 
 
@@ -19,7 +20,9 @@ class RelabelGoals(Transform):
 
     Args:
         workspace: Where goals are drawn uniformly.
-        goals: ``"uniform"`` draws a goal for each sequence, ``"stored"`` keeps the goals of the dataset.
+        goals: ``"uniform"`` draws a goal for each sequence, ``"stored"`` keeps the goals of the dataset. ``"auto"``
+            keeps them if the images show them, and draws goals otherwise;
+            :func:`~torchrl_ocwm.data.make_replay_buffer` knows whether they do.
         object_index: Which object is to be positioned.
 
     Reads ``("next", "object_position")`` ``[B, T, O, D]`` in metres, writes ``("next", "goal_position")``
@@ -33,18 +36,41 @@ class RelabelGoals(Transform):
         True
     """
 
+    #: The keys that it writes.
+    written = (("next", "goal_position"), ("next", "reward"))
+
     def __init__(
-        self, workspace: Workspace, *, goals: Literal["uniform", "stored"] = "uniform", object_index: int = 0
+        self, workspace: Workspace, *, goals: Literal["auto", "uniform", "stored"] = "auto", object_index: int = 0
     ) -> None:
-        if goals not in ("uniform", "stored"):
-            raise ValueError(f"goals must be 'uniform' or 'stored', got {goals!r}")
+        if goals not in ("auto", "uniform", "stored"):
+            raise ValueError(f"goals must be 'auto', 'uniform' or 'stored', got {goals!r}")
         super().__init__()
         self.workspace, self.goals, self.object_index = workspace, goals, object_index
+        self._images_show_goal = False
+
+    def sample_from(self, dataset: EpisodeDataset) -> None:
+        """Take note of what the sequences are sampled from.
+
+        Raises:
+            DatasetError: if goals are to be drawn while the images show other ones, or to be kept and there are none.
+        """
+        self._images_show_goal = dataset.images_show_goal
+        if self._images_show_goal and self.goals == "uniform":
+            raise DatasetError(
+                f"{dataset.path}: its images show the goals of its episodes (virtual_target), so that other goals "
+                "would contradict them; use goals='stored'"
+            )
+        if not self._draws and ("next", "goal_position") not in dataset.records.keys(True):
+            raise DatasetError(f"{dataset.path}: holds no goals ('next/goal_position') to keep; use goals='uniform'")
+
+    @property
+    def _draws(self) -> bool:
+        return self.goals == "uniform" or (self.goals == "auto" and not self._images_show_goal)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write goals and rewards into a batch ``[B, T]``."""
         position = tensordict["next", "object_position"][..., self.object_index, :]
-        if self.goals == "uniform":
+        if self._draws:
             goal = self.workspace.sample(position.shape[:-2]).to(position).unsqueeze(-2).expand_as(position)
             tensordict["next", "goal_position"] = goal.contiguous()
         distance = torch.linalg.vector_norm(position - tensordict["next", "goal_position"], dim=-1, keepdim=True)

@@ -5,24 +5,40 @@ from __future__ import annotations
 from typing import Any
 
 from tensordict import TensorDictBase
-from torchrl.data import ReplayBuffer, SliceSampler, TensorStorage
+from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, SliceSampler, TensorStorage
 from torchrl.envs import Compose, Transform
 
-from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
+from torchrl_ocwm.data.dataset import EpisodeDataset
 from torchrl_ocwm.data.memory import release_pages
+from torchrl_ocwm.data.relabel import RelabelGoals
 
 
 class MemoryMappedStorage(TensorStorage):
-    """A storage over memory-mapped data that hands pages back after each read, so that its memory stays flat.
+    """A storage to read memory-mapped data from; pages are handed back after each read, so that memory stays flat.
 
     Args:
         storage: Memory-mapped tensordict ``[N]``.
+        refusal: What to say to those who want to write.
     """
+
+    def __init__(self, storage: TensorDictBase, refusal: str) -> None:
+        super().__init__(storage)
+        self.refusal = refusal
 
     def get(self, index: Any) -> TensorDictBase:
         data = super().get(index)
         release_pages(self._storage)
         return data
+
+    def set(self, *arguments: Any, **options: Any) -> None:  # noqa: ARG002
+        """Refuse to write.
+
+        Raises:
+            RuntimeError: always.
+        """
+        raise RuntimeError(self.refusal)
+
+    load_state_dict = set  # noqa: A003
 
 
 class StackSlices(Transform):
@@ -55,6 +71,9 @@ def make_replay_buffer(
     The first record of a sequence has ``is_init`` set, also in the middle of an episode: there the model starts from
     the zero state without a previous action, as the policy does at the first frame of an episode.
 
+    The buffer is to be read: it refuses ``extend``, ``add`` and the like, and the dataset stays as it is. Episodes that
+    are shorter than a sequence are skipped, with a warning.
+
     Args:
         dataset: Where to sample from.
         batch_size: Sequences per batch B.
@@ -63,7 +82,8 @@ def make_replay_buffer(
         exclude: Keys that are not read.
 
     Raises:
-        DatasetError: if an episode is shorter than ``slice_len``.
+        DatasetError: if all episodes are shorter than ``slice_len``, or the transform wants other goals than the
+            dataset can give.
 
     Examples:
         >>> import tempfile, torch
@@ -76,16 +96,22 @@ def make_replay_buffer(
         ...     make_replay_buffer(dataset, batch_size=2, slice_len=4, exclude=()).sample().batch_size
         torch.Size([2, 4])
     """
-    shortest = min(dataset.episode_lengths)
-    if slice_len > shortest:
-        raise DatasetError(
-            f"{dataset.path}: cannot cut sequences of {slice_len} frames, the shortest episode has {shortest}; "
-            "choose shorter sequences or collect longer episodes"
-        )
-    transforms = [StackSlices(slice_len), *([] if transform is None else [transform])]
+    dataset.long_enough(slice_len)
+    transforms = Compose(StackSlices(slice_len), *([] if transform is None else [transform]))
+    for part in transforms.modules():
+        if isinstance(part, RelabelGoals):
+            part.sample_from(dataset)
+    refusal = (
+        f"{dataset.path}: this buffer only samples; add episodes with EpisodeDataset.open(path, write=True).append"
+        "(episode_to_records(rollout)), and make a new buffer"
+    )
+    writer = ImmutableDatasetWriter()
+    writer.WRITING_ERR = refusal
     return ReplayBuffer(
-        storage=MemoryMappedStorage(dataset.records.exclude(*exclude)),
+        storage=MemoryMappedStorage(dataset.records.exclude(*exclude), refusal),
+        # Skips episodes that are too short.
         sampler=SliceSampler(slice_len=slice_len, trajectories=dataset.trajectories, cache_values=True),
-        transform=Compose(*transforms),
+        writer=writer,
+        transform=transforms,
         batch_size=batch_size * slice_len,
     )

@@ -24,7 +24,7 @@ def random_sequences(dataset: EpisodeDataset, sequences: int, length: int, *, se
         ``[N, T]`` records, the first of each sequence with ``is_init`` set.
 
     Raises:
-        ValueError: if an episode is shorter than that.
+        DatasetError: if all episodes are shorter than that.
 
     Examples:
         >>> import tempfile
@@ -34,10 +34,8 @@ def random_sequences(dataset: EpisodeDataset, sequences: int, length: int, *, se
         ...     random_sequences(dataset, 6, 15)["is_init"].squeeze(-1).nonzero()[:, 1]
         tensor([0, 0, 0, 0, 0, 0])
     """
-    lengths = torch.tensor(dataset.episode_lengths)
-    if length > lengths.min():
-        raise ValueError(f"{dataset.path}: sequences of {length} records do not fit in an episode of {lengths.min()}")
-    episodes = torch.linspace(0, len(lengths) - 1, sequences).long()
+    lengths, fitting = torch.tensor(dataset.episode_lengths), torch.tensor(dataset.long_enough(length))
+    episodes = fitting[torch.linspace(0, len(fitting) - 1, sequences).long()]
     room = lengths[episodes] - length + 1
     starts = (lengths.cumsum(0) - lengths)[episodes]
     starts += (torch.rand(sequences, generator=torch.Generator().manual_seed(seed)) * room).long()

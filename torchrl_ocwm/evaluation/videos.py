@@ -137,7 +137,7 @@ class OpenLoopFilm:
         dataset: Where the sequences are from.
         folder: Where the videos go.
         sequences: How many.
-        length: Frames of each, at most the shortest episode.
+        length: Frames of each, at most those of half of the episodes.
         context: Frames that the model sees.
 
     Raises:
@@ -159,8 +159,9 @@ class OpenLoopFilm:
         check_ffmpeg()
         self.agent, self.folder, self.context = agent, Path(folder), context
         lengths = torch.tensor(dataset.episode_lengths)
-        length = min(length, int(lengths.min()))
-        episodes = torch.linspace(0, len(lengths) - 1, sequences).long()
+        length = min(length, int(lengths.median()))
+        fitting = (lengths >= length).nonzero().flatten()
+        episodes = fitting[torch.linspace(0, len(fitting) - 1, sequences).long()]
         starts = lengths.cumsum(0)[episodes] - lengths[episodes]
         self.records = dataset.records[starts[:, None] + torch.arange(length)].contiguous()
 

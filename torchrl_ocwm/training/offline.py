@@ -20,7 +20,6 @@ from torchrl_ocwm.agents.archive import Archive, recover
 from torchrl_ocwm.agents.checkpoint import check_same_agent, describe
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals, make_replay_buffer
 from torchrl_ocwm.devices import usable_device
-from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.files import only_writer
 from torchrl_ocwm.training.hooks import Every, LossLog, ProgressBar, RunTrainer, StopOnSignals, UpdateClock
 from torchrl_ocwm.training.loggers import make_loggers
@@ -212,9 +211,12 @@ def _load(trainer: RunTrainer, file: Path) -> None:
 
 
 def _check_task(agent: Agent, dataset: EpisodeDataset) -> None:
-    there = Task.from_dict(dataset.metadata["task"])
-    if there != agent.task:
-        raise DatasetError(f"{dataset.path}: holds {there}, but the agent was built for {agent.task}")
+    if dataset.task != agent.task:
+        raise DatasetError(f"{dataset.path}: holds {dataset.task}, but the agent was built for {agent.task}")
+    there = {*dataset.records.keys(True, True), *RelabelGoals.written}
+    missing = [key for key in agent.loss.in_keys if key not in there]
+    if missing:
+        raise DatasetError(f"{dataset.path}: holds no {missing}, which this agent learns from")
 
 
 @contextmanager

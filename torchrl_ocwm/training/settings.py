@@ -31,7 +31,7 @@ class Training(Settings):
         eval_steps: Steps per episode.
         video_interval: Updates between two open-loop prediction videos; 0 for none.
         goals: Goals of the sampled sequences: ``"uniform"`` draws a fresh one for each, ``"stored"`` keeps those of the
-            dataset.
+            dataset, ``"auto"`` keeps them if the images show them (``virtual_target``), and draws them otherwise.
         compile: Compile the update; ``None`` does so on a GPU only. Takes minutes.
         cudagraph: Capture the update in a CUDA graph; ``None`` does so on a GPU.
         mixed_precision: Products and convolutions in bfloat16. Faster where the device has instructions for it, and the
@@ -54,7 +54,7 @@ class Training(Settings):
     eval_episodes: int = setting(10, at_least=1)
     eval_steps: int = setting(100, at_least=1)
     video_interval: int = setting(2000, at_least=0)
-    goals: Literal["uniform", "stored"] = setting("uniform", resume="asked")
+    goals: Literal["auto", "uniform", "stored"] = setting("auto", resume="asked")
     compile: bool | None = None
     cudagraph: bool | None = None
     mixed_precision: bool = setting(False, resume="asked")
