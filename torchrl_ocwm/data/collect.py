@@ -156,7 +156,7 @@ def _make_collector(
     first_seeds = torch.randint(2**31, (workers,)).tolist()
     make = _scripted_env if isinstance(policy, ScriptedPolicy) else make_env
     collector = MultiSyncCollector(
-        [partial(make, environment, seed=first_seed, **options) for first_seed in first_seeds],
+        [partial(make, environment, seed=first_seed, **{**options, "privileged": True}) for first_seed in first_seeds],
         policy,
         frames_per_batch=workers * 100,
         total_frames=-1,

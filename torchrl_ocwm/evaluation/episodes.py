@@ -37,7 +37,7 @@ class EvaluationEnvs:
     """
 
     def __init__(self, task: Task, *, episode_steps: int, workers: int = 2, envs: int = 10) -> None:
-        make = partial(make_env, task.name, horizon=episode_steps, **task.options)
+        make = partial(make_env, task.name, horizon=episode_steps, privileged=True, **task.options)
         serial = partial(SerialEnv, envs, make)
         self.task, self.episode_steps, self.shape = task, episode_steps, (max(workers, 1), envs)
         self.env: EnvBase = ParallelEnv(workers, serial, mp_start_method="spawn") if workers else SerialEnv(1, serial)
