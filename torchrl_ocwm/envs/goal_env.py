@@ -23,6 +23,11 @@ class GoalEnv(GymEnv):
         >>> env.close()
     """
 
+    def _make_specs(self, env: Any, batch_size: Any = None) -> None:
+        super()._make_specs(env, batch_size)
+        # TorchRL's transforms hand a reset only what is part of the state.
+        self.state_spec.set("goal_position", self.observation_spec["goal_position"].clone())
+
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         goal = None if tensordict is None else tensordict.get("goal_position", None)
         if goal is not None:
