@@ -75,7 +75,7 @@ def main() -> None:
     size, seed = arguments.image_size, arguments.seed
     common = {"image_size": size, "horizon": 10**9, "render_mode": "rgb_array"}
     envs = [
-        gymnasium.make(ENVIRONMENTS[arguments.env].id, mask_scale=scale, **common).unwrapped
+        gymnasium.make(ENVIRONMENTS[arguments.env].id, mask_scale=scale, privileged=True, **common).unwrapped
         for scale in arguments.mask_scales
     ]
     numbers = f"{arguments.poses} poses, {arguments.episodes} episodes"

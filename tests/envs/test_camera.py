@@ -1,5 +1,8 @@
 """One camera for colours, segmentation and depth, checked on a scene whose picture is known."""
 
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+
 import mujoco
 import numpy as np
 import pytest
@@ -174,6 +177,72 @@ def test_more_geoms_than_a_byte_can_count():
         x, y = data.geom_xpos[ball, :2] - 0.475
         assert geoms[int(128 - focal * y / 1.5), int(128 + focal * x / 1.5)] == ball
     camera.close()
+
+
+# What a camera file can say of the lens: metres of the sensor, of its focal lengths and of its principal point.
+LENS = 'sensorsize=".02 .015" focal=".012 .014" principal=".002 -.001" resolution="100 80"'
+
+
+def test_sensor_focal_length_and_principal_point():
+    """Small balls appear where the lens puts them: u = W/2 + W/w (f x/z - c), v = H/2 - H/h (f y/z - c)."""
+    points = np.array([[0.1, 0.2, 0.0], [-0.4, -0.1, 0.1], [0.5, -0.3, 0.2], [-0.2, 0.3, -0.1]])
+    balls = "".join(f'<geom size=".03" pos="{x} {y} {z}"/>' for x, y, z in points)
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><camera name="lens" pos="0 0 1" {LENS}/>{balls}</worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = Camera(model, "lens", height=HEIGHT, width=WIDTH, mask_scale=4)
+    geoms = camera.render(data).geoms
+    for ball, (x, y, z) in enumerate(points):
+        column = WIDTH / 2 + WIDTH / 0.02 * (0.012 * x / (1 - z) - 0.002)
+        row = HEIGHT / 2 - HEIGHT / 0.015 * (0.014 * y / (1 - z) + 0.001)
+        seen = np.argwhere(geoms == ball).mean(0) + 0.5
+        assert seen / 4 == pytest.approx([row, column], abs=0.3)
+        homogeneous = camera.intrinsics @ [x / (1 - z), -y / (1 - z), 1.0]
+        assert homogeneous == pytest.approx([column, row, 1.0], abs=1e-3)
+    camera.close()
+
+
+def test_orthographic_cameras_are_refused():
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><camera name="flat" orthographic="true" fovy="2"/></worldbody></mujoco>'
+    )
+    with pytest.raises(ValueError, match="camera 'flat' is orthographic"):
+        Camera(model, "flat")
+
+
+def test_more_geoms_than_a_picture_has_room_for(open_camera, data):
+    assert (open_camera(max_geoms=3).render(data).geoms == BALL).any()
+    with pytest.raises(ValueError, match="more than 2 geoms; give the camera a larger max_geoms"):
+        open_camera(max_geoms=2).render(data)
+
+
+@pytest.mark.parametrize("number", [0, 65536])
+def test_max_geoms_is_bounded(open_camera, number):
+    with pytest.raises(ValueError, match=f"max_geoms must be from 1 to 65535, got {number}"):
+        open_camera(max_geoms=number)
+
+
+def test_a_camera_belongs_to_its_thread(open_camera, data):
+    camera = open_camera()
+    before = camera.render(data)
+    with ThreadPoolExecutor(1) as other:
+        for use in (lambda: camera.render(data), camera.close):
+            with pytest.raises(RuntimeError, match="belongs to the thread 'MainThread'.*in one thread"):
+                other.submit(use).result()
+    assert np.array_equal(camera.render(data).pixels, before.pixels)
+
+
+def test_a_camera_of_another_thread(model, data):
+    """A thread that makes a camera of its own can use it."""
+
+    def look():
+        with closing(Camera(model, "top", height=HEIGHT, width=WIDTH)) as camera:
+            return camera.render(data)
+
+    with ThreadPoolExecutor(1) as other:
+        assert (other.submit(look).result().geoms == BALL).any()
 
 
 def test_unknown_camera_lists_those_there_are(model):

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
+import random
 import sys
 import warnings
+import weakref
 from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import partial
 from itertools import product
+from pathlib import Path
 from typing import NamedTuple
 
 import gymnasium
@@ -17,9 +23,10 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from observations import actions, assert_same, error
+from torchrl.envs import SerialEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_ocwm.envs import ENVIRONMENTS, Task, make_env, make_task, registry
+from torchrl_ocwm.envs import ENVIRONMENTS, SimulationDivergedError, Task, make_env, make_task, registry
 from torchrl_ocwm.envs.positioning import PositioningEnv
 
 
@@ -101,16 +108,22 @@ def case(name: str) -> Case:
 
 @pytest.fixture(scope="module")
 def env(name: str) -> Iterator[PositioningEnv]:
-    env = gymnasium.make(ENVIRONMENTS[name].id).unwrapped
+    env = gymnasium.make(ENVIRONMENTS[name].id, privileged=True).unwrapped
     yield env
     env.close()
 
 
 @pytest.fixture(scope="module")
 def twin(name: str) -> Iterator[PositioningEnv]:
-    env = gymnasium.make(ENVIRONMENTS[name].id).unwrapped
-    env.reset(seed=99)
-    env.step(np.ones(env.action_space.shape))  # it has a past
+    env = gymnasium.make(ENVIRONMENTS[name].id, privileged=True).unwrapped
+    np.random.seed(1)
+    random.seed(1)
+    torch.manual_seed(1)
+    for seed in (99, None):  # it has a past
+        env.reset(seed=seed)
+        env.goal_observation(GOAL)
+        for action in actions(env, 15):
+            env.step(action)
     yield env
     env.close()
 
@@ -180,11 +193,20 @@ def test_observation_has_the_keys_shapes_and_types_of_the_contract(env: Position
         "object_position": ((1, 2), np.float32),
         "object_visible": ((1,), np.bool_),
         "goal_position": ((2,), np.float32),
-        "object_position_true": ((1, 2), np.float32),
+        "object_position_true": ((1, 2), np.float32),  # asked for
     }
     assert env.action_space == gymnasium.spaces.Box(-1, 1, (case.actions,), np.float32)
     assert env.observation_space.contains(observation)
     assert env.observation_space.contains(env.step(np.ones(case.actions))[0])
+
+
+def test_true_positions_are_privileged(env: PositioningEnv, name: str) -> None:
+    with closing(gymnasium.make(ENVIRONMENTS[name].id).unwrapped) as plain:
+        observation, _ = plain.reset(seed=0)
+        privileged, _ = env.reset(seed=0)
+        assert plain.observation_space.contains(observation)
+        assert np.array_equal(plain.true_position(), privileged.pop("object_position_true"))
+        assert_same(observation, privileged)
 
 
 def test_reward_is_minus_the_distance_in_metres(env: PositioningEnv) -> None:
@@ -262,11 +284,25 @@ def test_actions_are_clipped(
 
 def test_same_seed_same_everything(env: PositioningEnv, twin: PositioningEnv) -> None:
     assert_same(env.reset(seed=9)[0], twin.reset(seed=9)[0])
+    assert np.array_equal(state(env), state(twin))
     for action in actions(env, 8):
         first, second = env.step(action), twin.step(action)
         assert_same(first[0], second[0])
         assert first[1:] == second[1:]
     assert_same(env.reset()[0], twin.reset()[0])
+
+
+def test_starts_through_torchrl_depend_on_their_seeds_alone(env: PositioningEnv, name: str) -> None:
+    """Environments side by side, in any number and order, start as one does on its own."""
+    make = partial(make_env, name, privileged=True)
+    with closing(SerialEnv(2, make, device=None)) as envs:
+        for seeds in ((21, 22), (22, 21), (23, 21)):
+            goals = [{"seed": seed, "options": {"goal_position": GOAL}} for seed in seeds]
+            starts = envs.reset(list_of_kwargs=goals)
+            for start, seed in zip(starts, seeds, strict=True):
+                alone, _ = env.reset(seed=seed, options={"goal_position": GOAL})
+                assert_same(alone, {key: start[key].numpy() for key in alone})
+            envs.rollout(3)
 
 
 def test_other_seed_other_start(env: PositioningEnv, twin: PositioningEnv, case: Case) -> None:
@@ -283,9 +319,60 @@ def test_closing_frees_the_camera_and_leaves_others_alone(env: PositioningEnv, n
     env.reset(seed=14)
     other.close()
     other.close()
-    with pytest.raises(RuntimeError, match="this camera is closed"):
+    with pytest.raises(RuntimeError, match="this environment is closed"):
         other.reset()
     assert_same(env.reset(seed=12)[0], before)
+
+
+@pytest.mark.parametrize("wrap", [lambda name: gymnasium.make(ENVIRONMENTS[name].id), make_env])
+def test_closing_frees_the_simulator_at_once(name: str, wrap: Callable) -> None:
+    """Wrappers keep the object until Python looks for cycles: what is large must not wait for that."""
+    gc.disable()
+    try:
+        env = wrap(name)
+        env.reset()
+        inner = env.unwrapped if isinstance(env, gymnasium.Env) else env.base_env._env.unwrapped
+        inner.goal_observation(GOAL)
+        large = [weakref.ref(part) for part in (inner.model, inner.data, inner._scratch, inner.camera._scene)]
+        env.close()
+        assert [part() for part in large] == [None] * 4
+    finally:
+        gc.enable()
+
+
+def test_a_closed_environment_says_so(name: str) -> None:
+    env = gymnasium.make(ENVIRONMENTS[name].id, image_size=16, render_mode="rgb_array").unwrapped
+    env.reset()
+    env.close()
+    for use in (env.reset, env.render, lambda: env.step(still(env)), lambda: env.goal_observation(GOAL)):
+        with pytest.raises(RuntimeError, match="this environment is closed"):
+            use()
+
+
+# A simulation that breaks down.
+
+
+@pytest.mark.parametrize(
+    ("velocity", "what"), [(1e12, "mjWARN_BADQ"), (np.nan, "mjWARN_BADQVEL"), (1e5, "mjWARN_|a body is")]
+)
+def test_a_simulation_that_breaks_down_ends_the_episode(
+    env: PositioningEnv, name: str, velocity: float, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log
+    before, _ = env.reset(seed=26)
+    env.data.qvel[:] = velocity
+    for _ in range(2):  # it stays broken until the next reset
+        with pytest.raises(SimulationDivergedError, match=what):
+            env.step(still(env))
+    assert_same(env.reset(seed=26)[0], before)
+    env.step(still(env))
+
+
+def test_a_body_that_leaves_the_world_ends_the_episode(env: PositioningEnv) -> None:
+    env.reset(seed=26)
+    env.data.xpos[-1] = 23_000.0
+    with pytest.raises(SimulationDivergedError, match=r"a body is 2\.3e\+04 m away"):
+        env.render() or env._observe(env.data)
 
 
 # Hidden objects.

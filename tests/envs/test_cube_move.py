@@ -24,14 +24,14 @@ FORWARD, RIGHT, DOWN = np.array([[-1, 0, -1], [0, 2**0.5, 0], [1, 0, -1]]) / 2**
 
 @pytest.fixture(scope="module")
 def env():
-    env = CubeMove()
+    env = CubeMove(privileged=True)
     yield env
     env.close()
 
 
 @pytest.fixture(scope="module")
 def pair():
-    env = CubeMove(objects=("cube", "distractor"))
+    env = CubeMove(objects=("cube", "distractor"), privileged=True)
     yield env
     env.close()
 

@@ -26,7 +26,7 @@ def name(request):
 
 @pytest.fixture(scope="module")
 def env(name):
-    env = CLASSES[name]()
+    env = CLASSES[name](privileged=True)
     yield env
     env.close()
 
@@ -34,7 +34,7 @@ def env(name):
 @pytest.fixture
 def small(name):
     """Small images, for tests of the physics."""
-    env = CLASSES[name](image_size=8)
+    env = CLASSES[name](image_size=8, privileged=True)
     yield env
     env.close()
 

@@ -297,3 +297,136 @@ def test_lens_of_a_known_angle():
     intrinsics = torch.tensor([[focal, 0, 50], [0, focal, 50], [0, 0, 1]])
     border = pixels_to_world(torch.tensor([[100.0, 0.0]]), intrinsics, torch.eye(4), depth=torch.tensor([1.0]))
     assert torch.allclose(border, torch.tensor([[1.0, -1.0, 1.0]]))
+
+
+# Depth images and masks as sensors and networks give them.
+
+INVALID = [0.0, -1.0, math.nan, math.inf, -math.inf]
+
+
+def seen_from_above(masks: torch.Tensor, depth: torch.Tensor) -> TensorDict:
+    """One frame of the camera TOP, looked at with its depth."""
+    data = TensorDict({"masks": masks[None], "depth": depth[None]}, [1])
+    return MaskToPosition(SMALL, TOP, depth="depth")(data)[0]
+
+
+@pytest.mark.parametrize("invalid", INVALID)
+def test_invalid_depth_in_the_background_changes_nothing(invalid):
+    depth = torch.full((1, 8, 8), 2.0)
+    expected = seen_from_above(one_pixel(2), depth)
+    depth[0, 0, 0] = depth[0, 4, 3] = invalid
+    found = seen_from_above(one_pixel(2), depth)
+    assert torch.equal(found["object_position"], expected["object_position"])
+    assert found["object_visible"].tolist() == [True]
+
+
+@pytest.mark.parametrize("invalid", INVALID)
+def test_invalid_depth_in_the_mask_is_no_part_of_it(invalid):
+    """Of three pixels in a row the right one is lost: the position is that of the other two."""
+    mask = torch.zeros(1, 8, 8, dtype=torch.bool)
+    mask[0, 4, 2:5] = True
+    depth = torch.full((1, 8, 8), 2.0)
+    depth[0, 4, 3], depth[0, 4, 4] = 1.0, invalid
+    found = seen_from_above(mask, depth)
+    # Centroid (3, 4.5), depth 1.5 below the camera at 2 metres.
+    assert found["object_position"][0].tolist() == pytest.approx([-0.1 * 1.5, -0.05 * 1.5, 0.5])
+
+
+@pytest.mark.parametrize("invalid", INVALID)
+def test_an_object_without_valid_depth_is_hidden(invalid):
+    found = seen_from_above(one_pixel(2), torch.full((1, 8, 8), invalid))
+    assert found["object_visible"].tolist() == [False]
+    assert found["object_position"].tolist() == [[0.0, 0.0, 0.0]]
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_large_masks_with_depth_of_any_float_type(dtype):
+    masks, depth = torch.ones(1, 480, 640, dtype=torch.bool), torch.full((1, 480, 640), 1.5, dtype=dtype)
+    camera = torch.tensor([[100.0, 0, 220], [0, 100, 240], [0, 0, 1]], dtype=torch.float64)
+    position, visible = masks_to_positions(masks, camera, torch.eye(4, dtype=torch.float64), depth=depth)
+    assert position.dtype == torch.float32
+    assert position[0].tolist() == pytest.approx([1.5, 0.0, 1.5], abs=1e-4)
+    assert visible.tolist() == [True]
+
+
+def test_mixed_precision_around_it_changes_nothing():
+    masks = torch.ones(1, 480, 640, dtype=torch.bool)
+    known = {"plane": torch.tensor([0.0, 0.0, 1.0, 0.05])}
+    expected, _ = masks_to_positions(masks, INTRINSICS, CAMERAS[0], **known)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found, _ = masks_to_positions(masks, INTRINSICS, CAMERAS[0], **known)
+    assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.uint16, torch.int32])
+def test_depth_of_integers_is_refused(dtype):
+    with pytest.raises(ValueError, match=rf"depth must be in metres as float, got {dtype}; .*depth.float\(\) / 1000"):
+        seen_from_above(one_pixel(2), torch.full((1, 8, 8), 2000, dtype=torch.int32).to(dtype))
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (2, 8, 8), (1, 8, 9)])
+def test_depth_of_another_shape_is_refused(shape):
+    with pytest.raises(ValueError, match=r"need depth \[\.\.\., 1, H, W\], got \(1, 1, 8, 8\) and"):
+        seen_from_above(one_pixel(2), torch.ones(shape))
+
+
+@pytest.mark.parametrize("white", [1, 255])
+def test_masks_of_bytes(white):
+    expected = MaskToPosition(SMALL, TOP, plane=FLOOR)(TensorDict({"masks": one_pixel(2)[None]}, [1]))
+    masks = one_pixel(2)[None].to(torch.uint8) * white
+    found = MaskToPosition(SMALL, TOP, plane=FLOOR)(TensorDict({"masks": masks}, [1]))
+    assert torch.equal(found["object_position"], expected["object_position"])
+
+
+def test_masks_of_probabilities_are_refused():
+    with pytest.raises(ValueError, match=r"masks must be bool, got torch.float32; for probabilities give masks > 0.5"):
+        MaskToPosition(SMALL, TOP, plane=FLOOR)(TensorDict({"masks": one_pixel(2)[None].float()}, [1]))
+
+
+@pytest.mark.parametrize("target", [(0.0, 0.0, 2.0), (0.0, 0.0, 0.8)], ids=["above the horizon", "along it"])
+def test_a_ray_that_misses_the_plane_is_hidden(target):
+    camera = look_at((1.5, 0.0, 0.8), target)
+    mask = torch.zeros(1, SIZE, SIZE, dtype=torch.bool)
+    mask[0, 89:91, 99:101] = True  # around the optical axis
+    position, visible = masks_to_positions(mask, INTRINSICS, camera, plane=torch.tensor(FLOOR))
+    assert visible.tolist() == [False]
+    assert position.tolist() == [[0.0, 0.0, 0.0]]
+
+
+def test_a_held_position_ends_with_its_episode():
+    """Slices of episodes in one row: the second starts at 4, hidden."""
+    columns = [2, 3, None, None, None, None, 6, None]
+    data = TensorDict({"masks": torch.stack([one_pixel(column) for column in columns])}, [8])
+    data["is_init"] = torch.zeros(8, 1, dtype=torch.bool)
+    data["is_init"][[0, 4]] = True
+    transform = MaskToPosition(SMALL, TOP, plane=FLOOR, axes=(0, 1))
+    position = transform(data.clone())["object_position"].squeeze(1).tolist()
+    nowhere = [0.0, 0.0]
+    seen = [position_of(column) for column in (2, 3, 3, 3)]
+    assert position == [*seen, nowhere, nowhere, position_of(6), position_of(6)]
+    # The same under another key, and for each sequence of a batch.
+    transform = MaskToPosition(SMALL, TOP, plane=FLOOR, axes=(0, 1), is_init=("collector", "first"))
+    data["collector"] = TensorDict({"first": data.pop("is_init")}, [8])
+    rows = torch.stack([data, data.clone()])
+    rows["collector", "first"][1] = False
+    both = transform(rows)["object_position"].squeeze(2)
+    assert both[0].tolist() == position
+    assert both[1, 4].tolist() == position_of(3)
+
+
+def test_matrices_of_numpy():
+    data = TensorDict({"masks": one_pixel(2)[None]}, [1])
+    expected = MaskToPosition(SMALL, TOP, plane=FLOOR)(data.clone())
+    found = MaskToPosition(SMALL.double().numpy(), TOP.numpy(), plane=(0, 0, 1, 0), start=(0, 0, 0))(data)
+    assert torch.equal(found["object_position"], expected["object_position"])
+
+
+@pytest.mark.parametrize(("intrinsics", "extrinsics", "name"), [(TOP, TOP, "intrinsics"), (SMALL, SMALL, "extrinsics")])
+def test_matrices_of_another_shape(intrinsics, extrinsics, name):
+    with pytest.raises(ValueError, match=f"the camera's {name} must be a matrix"):
+        MaskToPosition(intrinsics, extrinsics, plane=FLOOR)
+
+
+def test_a_plane_without_direction():
+    with pytest.raises(ValueError, match="has no direction"):
+        MaskToPosition(SMALL, TOP, plane=(0.0, 0.0, 0.0, 1.0))

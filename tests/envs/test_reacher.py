@@ -19,7 +19,7 @@ GOAL = np.array([0.1, -0.12], np.float32)
 
 @pytest.fixture(scope="module")
 def env():
-    env = Reacher()
+    env = Reacher(privileged=True)
     yield env
     env.close()
 
@@ -63,7 +63,7 @@ def test_render_shows_the_pixels(env):
 
 @pytest.mark.parametrize("image_size", [48, 96])
 def test_image_size(image_size):
-    env = Reacher(image_size=image_size)
+    env = Reacher(image_size=image_size, privileged=True)
     observation, _ = env.reset(seed=0)
     env.close()
     assert observation["pixels"].shape == (3, image_size, image_size)
@@ -154,7 +154,7 @@ def load_benchmark():
 
 @pytest.mark.parametrize(("mask_scale", "median", "rare"), [(1, 2.3, 4.5), (2, 0.75, 2.0)])
 def test_position_error_over_random_poses(mask_scale, median, rare):
-    with closing(Reacher(mask_scale=mask_scale)) as env:
+    with closing(Reacher(mask_scale=mask_scale, privileged=True)) as env:
         errors = load_benchmark().of_poses(env, 60, seed=0)
     assert not np.isnan(errors).any()
     assert np.median(errors) == pytest.approx(median, rel=0.2)
@@ -172,7 +172,7 @@ def test_position_error_sees_hidden_poses_and_wrong_positions(visible, expected)
 
 
 def test_finer_masks_are_sampled_at_the_size_of_the_images(env):
-    with closing(Reacher(mask_scale=3)) as fine:
+    with closing(Reacher(mask_scale=3, privileged=True)) as fine:
         coarse, same = (one.reset(seed=5, options={"goal_position": GOAL})[0] for one in (env, fine))
     assert np.array_equal(same["pixels"], coarse["pixels"])
     assert np.array_equal(same["masks"], coarse["masks"])  # with an odd scale the samples are at the same places

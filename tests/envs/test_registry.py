@@ -1,9 +1,15 @@
 """make_env and make_task: names, seeds, goals, several processes, and what is said when a simulator is missing."""
 
+import subprocess
+import sys
+from contextlib import closing
+from functools import partial
+
 import gymnasium
 import pytest
 import torch
-from torchrl.envs import ParallelEnv, TransformedEnv
+from tensordict import TensorDict
+from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_ocwm.envs import ENVIRONMENTS, Reacher, Task, make_env, make_task, registry
@@ -44,7 +50,6 @@ def test_keys_of_a_rollout(env):
         "object_position": ((1, 2), torch.float32),
         "object_visible": ((1,), torch.bool),
         "goal_position": ((2,), torch.float32),
-        "object_position_true": ((1, 2), torch.float32),
         "is_init": ((1,), torch.bool),
         "reward": ((1,), torch.float32),
         "done": ((1,), torch.bool),
@@ -64,6 +69,61 @@ def test_goal_at_reset(env):
     assert torch.equal(rollout["next", "goal_position"], goal.expand(3, 2))
     distance = (rollout["next", "object_position"][:, 0] - goal).norm(dim=-1, keepdim=True)
     assert torch.allclose(rollout["next", "reward"], -distance, atol=1e-6)
+
+
+def test_goal_in_the_tensordict_given_to_reset(env):
+    goal = torch.tensor([0.12, -0.03])
+    drawn = env.reset(seed=3)
+    first = env.reset(TensorDict({"goal_position": goal}), seed=3)
+    assert torch.equal(first["goal_position"], goal)
+    assert torch.equal(first["proprio"], drawn["proprio"])
+    rollout = env.rollout(10, auto_reset=False, tensordict=first, break_when_any_done=False)
+    assert torch.equal(rollout["goal_position"][:4], goal.expand(4, 2))
+    assert not (rollout["goal_position"][4:] == goal).any()  # the next episodes draw their own
+    options = {"goal_position": (0.05, 0.05)}
+    assert env.reset(first, options=options)["goal_position"].tolist() == pytest.approx([0.05, 0.05])
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [([0.3, 0.0], "outside the workspace"), ([float("nan"), 0.0], "must be finite"), ([0.1], "has 2 coordinates")],
+)
+def test_goal_in_a_tensordict_is_checked(env, goal, message):
+    with pytest.raises(ValueError, match=message):
+        env.reset(TensorDict({"goal_position": torch.tensor(goal)}))
+
+
+def test_goals_in_a_tensordict_for_environments_side_by_side(pair):
+    goals = torch.tensor([[0.1, 0.05], [-0.2, 0.0]])
+    with closing(SerialEnv(2, partial(make_env, "reacher", image_size=16))) as serial:
+        for env in (serial, pair):
+            first = env.reset(TensorDict({"goal_position": goals}, [2]))
+            assert torch.equal(first["goal_position"], goals)
+            # One is done: its next episode has another goal, while the other keeps its own.
+            first["_reset"] = torch.tensor([[True], [False]])
+            again = env.reset(first.select("_reset"))
+            assert not torch.equal(again["goal_position"][0], goals[0])
+
+
+def test_seeds_side_by_side(env, pair):
+    """What an episode looks like does not depend on the process it runs in."""
+    for seeds in ((31, 32), (32, 31)):
+        starts = pair.reset(list_of_kwargs=[{"seed": seed, "options": {"goal_position": (0.1, 0.1)}} for seed in seeds])
+        for start, seed in zip(starts, seeds, strict=True):
+            assert torch.equal(start["proprio"], env.reset(seed=seed)["proprio"])
+            assert start["goal_position"].tolist() == pytest.approx([0.1, 0.1])
+
+
+def test_gymnasium_finds_the_environments_by_module():
+    code = "import gymnasium; print(gymnasium.make('torchrl_ocwm.envs:ocwm/Reacher-v0').action_space.shape)"
+    done = subprocess.run([sys.executable, "-W", "error::UserWarning", "-c", code], capture_output=True, text=True)
+    assert done.stdout == "(2,)\n", done.stderr
+
+
+def test_true_positions_are_privileged():
+    with closing(make_env("reacher", privileged=True, image_size=16)) as env:
+        assert env.rollout(2)["next", "object_position_true"].shape == (2, 1, 2)
+    assert make_task("reacher", privileged=True) == make_task("reacher")
 
 
 def test_seed_repeats_a_rollout(env):

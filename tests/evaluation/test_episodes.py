@@ -113,7 +113,7 @@ def test_each_environment_keeps_its_goal_image(task: Task, workers: int) -> None
 
 def test_goal_images_show_the_object_at_the_goal(task: Task) -> None:
     places = goals(task, 3)
-    with gymnasium.make("ocwm/Reacher-v0") as env:
+    with gymnasium.make("ocwm/Reacher-v0", privileged=True) as env:
         env.reset(seed=5)
         for place, image in zip(places, goal_images(task, places), strict=True):
             there = env.unwrapped.goal_observation(place.numpy())

@@ -110,7 +110,9 @@ def collect(
             return _with_coverage(dataset, task)
     done = dataset.num_steps if dataset is not None else 0
 
-    make_player = partial(EpisodePlayer, partial(make_env, environment, **options), module, settings.seed)
+    make_player = partial(
+        EpisodePlayer, partial(make_env, environment, **{**options, "privileged": True}), module, settings.seed
+    )
     played = play_in_order(make_player, settings, first=_next_number(dataset))
     bar = tqdm(total=settings.steps, initial=done, unit="step", desc=f"collect {environment}", disable=not progress)
     with bar, ExitStack() as writing, closing(played) as episodes:

@@ -11,6 +11,7 @@ from torchrl_ocwm.envs.opengl import import_mujoco
 if find_spec("mujoco") is not None:
     import_mujoco()  # TorchRL imports it too, and would fail without saying what is missing
 
+from torchrl_ocwm.envs.goal_env import GoalEnv
 from torchrl_ocwm.envs.positions import MaskToPosition, hold_last_seen, mask_centroid, masks_to_positions
 from torchrl_ocwm.envs.registry import ENVIRONMENTS, make_env, make_task
 from torchrl_ocwm.envs.scripted import ScriptedAction
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from torchrl_ocwm.envs.camera import Camera, Frame
     from torchrl_ocwm.envs.cube_move import CubeMove
     from torchrl_ocwm.envs.meta_world import PickPlace, ShelfPlace
-    from torchrl_ocwm.envs.positioning import PositioningEnv
+    from torchrl_ocwm.envs.positioning import PositioningEnv, SimulationDivergedError
     from torchrl_ocwm.envs.reacher import Reacher
 
 __all__ = [
@@ -29,12 +30,14 @@ __all__ = [
     "Camera",
     "CubeMove",
     "Frame",
+    "GoalEnv",
     "MaskToPosition",
     "PickPlace",
     "PositioningEnv",
     "Reacher",
     "ScriptedAction",
     "ShelfPlace",
+    "SimulationDivergedError",
     "Task",
     "Workspace",
     "hold_last_seen",
@@ -53,6 +56,7 @@ _LAZY = {
     "PositioningEnv": "positioning",
     "Reacher": "reacher",
     "ShelfPlace": "meta_world",
+    "SimulationDivergedError": "positioning",
 }
 
 if find_spec("gymnasium") is not None:

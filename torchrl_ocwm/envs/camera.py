@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,9 @@ if TYPE_CHECKING:
     import mujoco
 else:
     mujoco = import_mujoco()
+
+
+_MAX_GEOMS = 1 << 16  # two bytes of their colour hold their number
 
 
 class Frame(NamedTuple):
@@ -45,10 +49,12 @@ class Camera:
         shadows: Draw shadows.
         reflections: Draw reflections.
         multisampling: Samples per pixel of the colour pass, 0 for none.
+        max_geoms: Geoms that a picture may have, at most 65,535.
 
     Raises:
-        ValueError: if the model has no such camera.
-        RuntimeError: if no OpenGL library works, with what to install.
+        ValueError: if the model has no such camera, the camera is orthographic, or a picture has more geoms.
+        RuntimeError: if no OpenGL library works, with what to install; if the camera is closed, or used in another
+            thread than the one that made it.
 
     Examples:
         >>> import mujoco
@@ -80,11 +86,17 @@ class Camera:
         if self.camera_id < 0:
             names = [model.camera(index).name for index in range(model.ncam)]
             raise ValueError(f"the model has no camera {camera!r}; it has {names}")
+        if model.cam_orthographic[self.camera_id]:
+            raise ValueError(f"camera {camera!r} is orthographic; positions need one with perspective")
+        if not 0 < max_geoms < _MAX_GEOMS:
+            raise ValueError(f"max_geoms must be from 1 to {_MAX_GEOMS - 1}, got {max_geoms}")
         self.model, self.height, self.width, self.mask_scale = model, height, width, mask_scale
+        self._thread = threading.current_thread()
         self._context: Any = None
         self._gl: Any = None
         self._set_up(multisampling, shadows)
-        self._scene = mujoco.MjvScene(model, maxgeom=max_geoms)
+        self._max_geoms = max_geoms
+        self._scene = mujoco.MjvScene(model, maxgeom=max_geoms + 1)  # the last one shows that there are too many
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
         self._known_scene: tuple[int, bytes] | None = None
@@ -129,9 +141,11 @@ class Camera:
         """
         if self._context is None:
             raise RuntimeError("this camera is closed")
-        self._gl.make_current()
+        self._make_current()
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self.model, data, self._options, None, self._view, everything, self._scene)
+        if self._scene.ngeom > self._max_geoms:
+            raise ValueError(f"the scene has more than {self._max_geoms} geoms; give the camera a larger max_geoms")
         mujoco.mjr_render(self._rectangle, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._rectangle, self._context)
 
@@ -143,6 +157,14 @@ class Camera:
         # OpenGL's rows run upwards.
         return Frame(self._pixels[::-1].copy(), self._geoms(), self._metres() if depth else None)
 
+    def _make_current(self) -> None:
+        if threading.current_thread() is not self._thread:
+            raise RuntimeError(
+                f"this camera belongs to the thread {self._thread.name!r}, as OpenGL wants it; make, step and close an "
+                "environment in one thread"
+            )
+        self._gl.make_current()
+
     def _geoms(self) -> np.ndarray:
         # Which geoms are in the scene depends on what is transparent; reading the list is slow.
         scene = self._scene.ngeom, self.model.geom_rgba[:, 3].tobytes()
@@ -153,7 +175,7 @@ class Camera:
                 if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
                     self._geom_of_segment[geom.segid + 1] = geom.objid
         ids = self._ids[::-1]
-        return self._geom_of_segment[ids[..., 0] + (ids[..., 1].astype(np.int32) << 8)]  # fewer than 65,536 geoms
+        return self._geom_of_segment[ids[..., 0] + (ids[..., 1].astype(np.int32) << 8)]
 
     def _metres(self) -> np.ndarray:
         extent, clip = self.model.stat.extent, self.model.vis.map
@@ -165,8 +187,14 @@ class Camera:
     @property
     def intrinsics(self) -> np.ndarray:
         """``[3, 3]`` float32 pinhole matrix in pixels; the centre of the first pixel is (0.5, 0.5)."""
-        focal = self.height / 2 / np.tan(np.deg2rad(self.model.cam_fovy[self.camera_id]) / 2)
-        return np.array([[focal, 0, self.width / 2], [0, focal, self.height / 2], [0, 0, 1]], np.float32)
+        size, centre = np.array([self.width, self.height]), np.array([self.width, self.height]) / 2
+        sensor, lens = self.model.cam_sensorsize[self.camera_id], self.model.cam_intrinsic[self.camera_id]
+        if sensor.all():  # metres; it fills the image, so that pixels need not be square
+            focal = lens[:2] / sensor * size
+            centre = centre + lens[2:] * (-1, 1) / sensor * size
+        else:
+            focal = np.full(2, centre[1] / np.tan(np.deg2rad(self.model.cam_fovy[self.camera_id]) / 2))
+        return np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]], np.float32)
 
     def extrinsics(self, data: mujoco.MjData) -> np.ndarray:
         """``[4, 4]`` float32 camera-to-world matrix; x points right in the image, y down, z into the scene."""
@@ -179,7 +207,7 @@ class Camera:
     def close(self) -> None:
         """Free the OpenGL context. Closing twice does nothing."""
         if self._context is not None:
-            self._gl.make_current()  # it would free the buffers of whichever camera rendered last
+            self._make_current()  # it would free the buffers of whichever camera rendered last
             self._context.free()
         if self._gl is not None:
             self._gl.free()

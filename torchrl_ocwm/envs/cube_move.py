@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.positioning import PositioningEnv
 from torchrl_ocwm.envs.workspace import Workspace
 
@@ -35,17 +36,11 @@ def _quiet() -> Iterator[None]:
             os.environ["MUJOCO_GL"] = before
 
 
-try:
-    with _quiet():
-        from robosuite.controllers import load_composite_controller_config, load_part_controller_config
-        from robosuite.environments.manipulation.lift import Lift
-        from robosuite.models.objects import BoxObject
-        from robosuite.utils.placement_samplers import SequentialCompositeSampler, UniformRandomSampler
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        f"Cube move needs robosuite, and {error.name!r} is not installed: pip install 'torchrl-ocwm[robosuite]'",
-        name=error.name,
-    ) from None
+with needs("Cube move", "robosuite"), _quiet():
+    from robosuite.controllers import load_composite_controller_config, load_part_controller_config
+    from robosuite.environments.manipulation.lift import Lift
+    from robosuite.models.objects import BoxObject
+    from robosuite.utils.placement_samplers import SequentialCompositeSampler, UniformRandomSampler
 
 _GEOMS = {"cube": ("cube_g0_vis",), "distractor": ("distractor_g0_vis",)}
 _TABLE = 0.8  # metres, height of its top
@@ -140,6 +135,11 @@ class CubeMove(PositioningEnv):
         self._gripper = model.site("gripper0_right_grip_site").id
         self._cube = model.joint("cube_joint0").qposadr[0]
         return model, data
+
+    def _close_simulator(self) -> None:
+        suite = self.__dict__.pop("_suite", None)
+        if suite is not None:  # its parts refer to each other
+            suite.sim.model._model = suite.sim.data._data = None
 
     def _action_shape(self) -> tuple[int, ...]:
         return (self._suite.action_dim,)

@@ -8,20 +8,15 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 
+from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.positioning import PositioningEnv
 from torchrl_ocwm.envs.workspace import Workspace
 
-try:
+with needs("Shelf place and Pick & place", "metaworld"):
     from metaworld.envs.sawyer_pick_place_v3 import SawyerPickPlaceEnvV3
     from metaworld.envs.sawyer_shelf_place_v3 import SawyerShelfPlaceEnvV3
     from metaworld.policies.sawyer_pick_place_v3_policy import SawyerPickPlaceV3Policy
     from metaworld.sawyer_xyz_env import SawyerXYZEnv
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        f"Shelf place and Pick & place need metaworld, and {error.name!r} is not installed: "
-        "pip install 'torchrl-ocwm[metaworld]'",
-        name=error.name,
-    ) from None
 
 _EYE = (0.9, 0.0, 0.9)  # metres
 _START_SPREAD = 0.02  # metres
@@ -78,13 +73,15 @@ class _MetaWorld(PositioningEnv):
         world[list(self.axes)] += position
         return world
 
+    def _close_simulator(self) -> None:
+        self.__dict__.pop("_suite", None)
+
     def _action_shape(self) -> tuple[int, ...]:
         return (4,)  # the model has actuators for the fingers only: the hand follows a mocap body
 
     def _reset_simulator(self) -> None:
         x, y = self._start[:2] + self.np_random.uniform(-_START_SPREAD, _START_SPREAD, 2)
         self._suite._last_rand_vec = np.array([x, y, self._start[2], *self._suite_goal])
-        mujoco.mj_resetData(self.model, self.data)
         self._suite.reset_model()  # ends with mj_forward
 
     def _step_simulator(self, action: np.ndarray) -> None:

@@ -7,20 +7,28 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import gymnasium
 import mujoco
 import numpy as np
 import torch
-from gymnasium import spaces
 
 from torchrl_ocwm.envs.camera import Camera
+from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.positions import masks_to_positions
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.envs.workspace import Workspace
 
+with needs("an environment", "dm-control"):
+    import gymnasium
+    from gymnasium import spaces
+
 TARGET_COLOUR = (230, 40, 40)
+_FARTHEST = 100  # times the size of the model; nothing gets there but by a jump
 
 Observation = dict[str, np.ndarray]
+
+
+class SimulationDivergedError(RuntimeError):
+    """The physics of an episode broke down, and what it showed since means nothing. A reset starts a new one."""
 
 
 class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -28,12 +36,13 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
 
     Observations follow the data contract (docs/data.md): ``pixels`` (3, H, W) uint8, ``masks`` (O, H, W) bool,
     ``proprio`` (P,) float32, ``object_position`` (O, D) float32 metres from the start position, estimated from the
-    masks, ``object_visible`` (O,) bool, ``goal_position`` (D,) float32 metres, and ``object_position_true`` (O, D),
-    the simulator's own value, kept for tests and evaluation only. A hidden object keeps the position where it was last
-    seen.
+    masks, ``object_visible`` (O,) bool, and ``goal_position`` (D,) float32 metres. A hidden object keeps the position
+    where it was last seen. With ``privileged`` there is also ``object_position_true`` (O, D), the simulator's own
+    value, for tests and evaluation.
 
     The reward is −‖p − p_g‖₂ in metres (paper, equation 1) of the first object; ``info["success"]`` says whether it is
-    within 5 cm. Episodes are truncated after ``horizon`` steps and never terminate.
+    within 5 cm. Episodes are truncated after ``horizon`` steps and never terminate. The start of an episode depends on
+    nothing but the seed given at its reset.
 
     A suite adds an environment by filling in the class attributes and the six abstract methods.
 
@@ -44,12 +53,15 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         mask_scale: How many times finer than the images the segmentation is that positions are read from, in height and
             width. ``masks`` are samples of it, as large as the images.
         virtual_target: Diameter in pixels of a disc drawn at the goal, 0 for none (paper, "Size matters!").
-        camera_options: Passed to :class:`~torchrl_ocwm.envs.Camera`: shadows, reflections, multisampling.
+        camera_options: Passed to :class:`~torchrl_ocwm.envs.Camera`: shadows, reflections, multisampling, max_geoms.
+        privileged: Add ``object_position_true`` to the observations.
         render_mode: ``"rgb_array"`` makes :meth:`render` return the camera image (H, W, 3).
 
     Raises:
         ValueError: for a horizon, action repeat, image size or mask scale below one, a goal outside the workspace, or
             an action that is not finite or has another shape.
+        SimulationDivergedError: if MuJoCo warns about its state, contacts or constraints, or throws a body far away.
+        RuntimeError: if the environment is closed.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
@@ -76,6 +88,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         mask_scale: int = 1,
         virtual_target: int = 0,
         camera_options: dict[str, Any] | None = None,
+        privileged: bool = False,
         render_mode: str | None = None,
     ) -> None:
         counts = {
@@ -91,6 +104,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
             raise ValueError(f"virtual_target is a diameter in pixels, 0 for none; got {virtual_target}")
         self.image_size, self.horizon, self.action_repeat = image_size, horizon, action_repeat
         self.mask_scale, self.virtual_target, self.render_mode = mask_scale, virtual_target, render_mode
+        self.privileged = privileged
         self.model, self.data = self._load()
         size: dict[str, Any] = {"height": image_size, "width": image_size, "mask_scale": mask_scale}
         self.camera = Camera(self.model, self.camera_name, **size, **(camera_options or {}))
@@ -104,7 +118,6 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         self._plane = None if self.plane is None else torch.tensor(self.plane)
         self._intrinsics = torch.from_numpy(self.camera.intrinsics)
         self._mask_intrinsics = self._intrinsics * torch.tensor([[mask_scale], [mask_scale], [1.0]])
-        self._extrinsics = torch.from_numpy(self.camera.extrinsics(self.data))
         self.observation_space = self._observation_space()  # type: ignore[assignment]
         self.action_space = spaces.Box(-1.0, 1.0, self._action_shape(), np.float32)
 
@@ -116,7 +129,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
 
     @abstractmethod
     def _reset_simulator(self) -> None:
-        """Draw a start state from ``self.np_random`` and bring ``self.data`` up to date."""
+        """Draw a start state from ``self.np_random`` into ``self.data``, which is as new, and bring it up to date."""
 
     @abstractmethod
     def _step_simulator(self, action: np.ndarray) -> None:
@@ -133,6 +146,9 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     @abstractmethod
     def _teleport(self, data: mujoco.MjData, position: np.ndarray) -> None:
         """Put the first object of ``data`` at a position (D,), metres from the start, or as near as can be."""
+
+    def _close_simulator(self) -> None:
+        """Let go of whatever else holds the model and its data, so that their memory is free at once."""
 
     def _action_shape(self) -> tuple[int, ...]:
         return (self.model.nu,)
@@ -167,6 +183,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
             seed: Seeds the environment's random numbers.
             options: ``{"goal_position": (D,)}`` gives the goal in metres; otherwise it is uniform in the workspace.
         """
+        self._check_open()
         super().reset(seed=seed)
         options = options or {}
         unknown = set(options) - {"goal_position"}
@@ -177,6 +194,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         if options.get("goal_position") is not None:
             goal = self._check_goal(options["goal_position"])
         self._goal = goal.astype(np.float32)
+        mujoco.mj_resetData(self.model, self.data)
         self._reset_simulator()
         self._steps = 0
         self._last_seen = np.zeros_like(self._last_seen)
@@ -186,6 +204,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict]:
         """Apply an action in [−1, 1] for ``action_repeat`` control steps; values beyond are clipped."""
+        self._check_open()
         action = np.asarray(action, np.float64)
         if action.shape != self.action_space.shape:
             raise ValueError(f"an action has shape {self.action_space.shape}, got {action.shape}")
@@ -204,12 +223,21 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         """The camera image (H, W, 3) uint8, with ``render_mode="rgb_array"``."""
         if self.render_mode != "rgb_array":
             return None
+        self._check_open()
         return np.ascontiguousarray(self._observe(self.data)["pixels"].transpose(1, 2, 0))
 
     def close(self) -> None:
-        """Free the OpenGL context."""
+        """Free the simulator and the OpenGL context. Closing twice does nothing."""
         if "camera" in self.__dict__:
             self.camera.close()
+        # Wrappers of gymnasium and TorchRL refer to each other, so that this object may stay for long.
+        for name in ("camera", "model", "data", "_scratch"):
+            self.__dict__.pop(name, None)
+        self._close_simulator()
+
+    def _check_open(self) -> None:
+        if "camera" not in self.__dict__:
+            raise RuntimeError("this environment is closed")
 
     # Goals and observations.
 
@@ -222,6 +250,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         Returns:
             An observation with the keys of the environment, ``goal_position`` set to the goal.
         """
+        self._check_open()
         goal = self._check_goal(goal_position)
         if self._scratch is None:
             self._scratch = mujoco.MjData(self.model)
@@ -245,19 +274,20 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         def real(*shape: int) -> spaces.Box:
             return spaces.Box(-np.inf, np.inf, shape, np.float32)
 
-        return spaces.Dict(
-            {
-                "pixels": spaces.Box(0, 255, (3, size, size), np.uint8),
-                "masks": spaces.Box(0, 1, (objects, size, size), np.bool_),
-                "proprio": real(*self._proprio(self.data).shape),
-                "object_position": real(objects, dim),
-                "object_visible": spaces.Box(0, 1, (objects,), np.bool_),
-                "goal_position": spaces.Box(*np.array([self.workspace.low, self.workspace.high], np.float32)),
-                "object_position_true": real(objects, dim),
-            }
-        )
+        keys: dict[str, spaces.Space] = {
+            "pixels": spaces.Box(0, 255, (3, size, size), np.uint8),
+            "masks": spaces.Box(0, 1, (objects, size, size), np.bool_),
+            "proprio": real(*self._proprio(self.data).shape),
+            "object_position": real(objects, dim),
+            "object_visible": spaces.Box(0, 1, (objects,), np.bool_),
+            "goal_position": spaces.Box(*np.array([self.workspace.low, self.workspace.high], np.float32)),
+        }
+        if self.privileged:
+            keys["object_position_true"] = real(objects, dim)
+        return spaces.Dict(keys)
 
     def _observe(self, data: mujoco.MjData, goal: np.ndarray | None = None) -> Observation:
+        self._check_physics(data)
         goal = self._goal if goal is None else goal
         frame = self.camera.render(data, depth=self._plane is None)
         fine_masks = np.array([_any_of(frame.geoms, ids) for ids in self._geom_ids])
@@ -265,21 +295,36 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         world, visible = masks_to_positions(
             torch.from_numpy(fine_masks),
             self._mask_intrinsics,
-            self._extrinsics,
+            torch.from_numpy(self.camera.extrinsics(data)),
             depth=None if frame.depth is None else torch.from_numpy(frame.depth[None] + self.depth_offset),
             plane=self._plane,
         )
         seen = visible.numpy()
         estimate = self._relative(world.numpy())
-        return {
-            "pixels": self._paint_target(frame.pixels, masks[0], goal).transpose(2, 0, 1),
+        observation = {
+            "pixels": self._paint_target(frame.pixels, masks[0], goal, data).transpose(2, 0, 1),
             "masks": masks.copy(),
             "proprio": self._proprio(data).astype(np.float32),
             "object_position": estimate if seen.all() else np.where(seen[:, None], estimate, self._last_seen),
             "object_visible": seen,
             "goal_position": goal.copy(),
-            "object_position_true": self._relative(self._true_position(data)),
         }
+        if self.privileged:
+            observation["object_position_true"] = self._relative(self._true_position(data))
+        return observation
+
+    def _check_physics(self, data: mujoco.MjData) -> None:
+        """MuJoCo goes on after a warning, with a state that is reset or contacts that are missing."""
+        for kind, warning in zip(mujoco.mjtWarning.__members__, data.warning, strict=False):
+            if warning.number and kind != "mjWARN_VGEOMFULL":  # the camera's own
+                raise SimulationDivergedError(f"MuJoCo's simulation broke down ({kind} at {warning.lastinfo})")
+        farthest = np.abs(data.xpos).max()
+        if not farthest < _FARTHEST * self.model.stat.extent:
+            raise SimulationDivergedError(f"MuJoCo's simulation broke down (a body is {farthest:.3g} m away)")
+
+    def true_position(self) -> np.ndarray:
+        """Where the objects are, (O, D) float32 metres from the start position: the simulator's own value."""
+        return self._relative(self._true_position(self.data))
 
     def _relative(self, world: np.ndarray) -> np.ndarray:
         return (world - self._start)[:, self._axes].astype(np.float32)
@@ -287,10 +332,12 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     def _distance(self, observation: Observation) -> float:
         return math.dist(observation["object_position"][0], observation["goal_position"])
 
-    def _paint_target(self, pixels: np.ndarray, entity: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    def _paint_target(
+        self, pixels: np.ndarray, entity: np.ndarray, goal: np.ndarray, data: mujoco.MjData
+    ) -> np.ndarray:
         if not self.virtual_target:
             return pixels
-        column, row = self.project(goal)
+        column, row = self._project(goal, data)
         centres = np.arange(self.image_size) + 0.5
         distance = np.hypot(centres[None] - column, centres[:, None] - row)
         disc = (distance <= self.virtual_target / 2) | (distance == distance.min())
@@ -299,9 +346,12 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def project(self, position: np.ndarray) -> np.ndarray:
         """Where a position (..., D), metres from the start, appears in the image: (..., 2) as (column, row)."""
+        return self._project(position, self.data)
+
+    def _project(self, position: np.ndarray, data: mujoco.MjData) -> np.ndarray:
         world = np.broadcast_to(self._start, (*position.shape[:-1], 3)).copy()
         world[..., self._axes] += position
-        pose = self._extrinsics.numpy()
+        pose = self.camera.extrinsics(data)
         in_camera = (world - pose[:3, 3]) @ pose[:3, :3]
         in_image = in_camera @ self._intrinsics.numpy().T
         return in_image[..., :2] / in_image[..., 2:]

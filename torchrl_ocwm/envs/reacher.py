@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from importlib.resources import as_file, files
+
 import mujoco
 import numpy as np
 
+from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.positioning import PositioningEnv
 from torchrl_ocwm.envs.workspace import Workspace
 
-try:
-    from dm_control.suite import reacher as dm_reacher
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        f"Reacher needs dm_control, and {error.name!r} is not installed: pip install 'torchrl-ocwm[dm-control]'",
-        name=error.name,
-    ) from None
+with needs("Reacher", "dm-control"):
+    import dm_control
+
+# dm_control.suite would load a renderer of its own, which may fail where MuJoCo's works.
+_SUITE = files(dm_control) / "suite"
 
 _LINK = 0.12  # metres, both links
 _WRIST_LIMIT = np.deg2rad(160)
@@ -65,13 +66,12 @@ class Reacher(PositioningEnv):
     plane = (0.0, 0.0, 1.0, 0.01)
 
     def _load(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        xml, assets = dm_reacher.get_model_and_assets()
-        model = mujoco.MjModel.from_xml_string(xml, assets)
+        with as_file(_SUITE) as folder:
+            model = mujoco.MjModel.from_xml_path(str(folder / "reacher.xml"))
         model.geom("target").rgba[3] = 0  # the task's own target; MuJoCo draws no geom with alpha 0
         return model, mujoco.MjData(model)
 
     def _reset_simulator(self) -> None:
-        mujoco.mj_resetData(self.model, self.data)
         low, high = np.array([-np.pi, -_WRIST_LIMIT]), np.array([np.pi, _WRIST_LIMIT])
         self.data.qpos[:] = self.np_random.uniform(low, high)
         mujoco.mj_forward(self.model, self.data)

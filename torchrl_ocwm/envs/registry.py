@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torchrl.envs import EnvBase, InitTracker, ParallelEnv, TransformedEnv
 
+from torchrl_ocwm.envs.goal_env import GoalEnv
 from torchrl_ocwm.envs.options import CubeMoveOptions, EnvOptions, MetaWorldOptions
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.settings import Settings, SettingsError, from_dict
@@ -93,11 +94,11 @@ def make_env(
         seed: Seeds the environments, each differently.
         device: Where observations are put.
         options: Passed to the environment: image_size, horizon, action_repeat, mask_scale, virtual_target,
-            camera_options.
+            camera_options, privileged.
 
     Returns:
         An environment with the keys of the data contract (docs/data.md) and ``is_init``. The goal of an episode can be
-        given at reset: ``env.reset(options={"goal_position": ...})``.
+        given at reset: ``env.reset(TensorDict({"goal_position": goals}, env.batch_size))``.
 
     Raises:
         ValueError: for an unknown name.
@@ -140,7 +141,7 @@ def make_task(name: str, **options: Any) -> Task:
             proprio=space["proprio"].shape[0],
             action=task.action_space.shape[0],
             workspace=task.workspace,
-            options={key: value for key, value in options.items() if key != "horizon"},
+            options={key: value for key, value in options.items() if key not in ("horizon", "privileged")},
         )
 
 
@@ -159,8 +160,6 @@ def _find(name: str) -> Environment:
 
 
 def _make_one(environment: Environment, *, device: torch.device | str | None, **options: Any) -> EnvBase:
-    from torchrl.envs import GymEnv
-
     import torchrl_ocwm.envs  # noqa: F401  (registers the ids in a fresh process)
 
-    return TransformedEnv(GymEnv(environment.id, device=device, **options), InitTracker())
+    return TransformedEnv(GoalEnv(environment.id, device=device, **options), InitTracker())

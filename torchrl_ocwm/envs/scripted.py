@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import Transform
 
@@ -27,7 +27,7 @@ class ScriptedAction(Transform):
 
     For some targets the policy misjudges where the object is, by up to 6 cm to each side and 8 cm upwards, closes the
     hand on nothing and carries on without the object. Without such data a world model learns that an object follows
-    whatever the hand does.
+    whatever the hand does. Targets and misses depend on nothing but the seed of the episode.
 
     Args:
         patience: Steps until a target is given up.
@@ -46,33 +46,35 @@ class ScriptedAction(Transform):
     """
 
     def __init__(self, *, patience: int = 60, misses: float = 0.3, action_key: NestedKey = "scripted_action") -> None:
-        super().__init__(in_keys=["object_position_true"], out_keys=[action_key])
+        super().__init__(in_keys=["goal_position"], out_keys=[action_key])
         if patience < 1:
             raise ValueError(f"patience must be at least 1 step, got {patience}")
         if not 0 <= misses <= 1:
             raise ValueError(f"misses must be a share between 0 and 1, got {misses}")
         self.patience, self.misses = patience, misses
-        self._target, self._error, self._left = torch.empty(0), torch.zeros(3), 0
+        self._target, self._error, self._left = np.empty(0), np.zeros(3), 0
+        self._random = np.random.default_rng()
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
-        self._aim(tensordict_reset["goal_position"])
+        self._random = self._simulator.np_random.spawn(1)[0]
+        self._aim(tensordict_reset[self.in_keys[0]].numpy(force=True))
         return self._write(tensordict_reset)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._left -= 1
-        position = next_tensordict.get(self.in_keys[0])[0]
-        if self._left == 0 or (position - self._target).norm() < _ARRIVED:
-            self._aim(self._simulator.workspace.sample())
+        position = self._simulator.true_position()[0]
+        if self._left == 0 or np.linalg.norm(position - self._target) < _ARRIVED:
+            workspace = self._simulator.workspace
+            self._aim(self._random.uniform(workspace.low, workspace.high))
         return self._write(next_tensordict)
 
-    def _aim(self, target: Tensor) -> None:
+    def _aim(self, target: np.ndarray) -> None:
         self._target, self._left = target, self.patience
-        low, high = torch.tensor(_MISS).T
-        misses = torch.rand(()) < self.misses
-        self._error = misses * (low + (high - low) * torch.rand(3))
+        misses = self._random.random() < self.misses
+        self._error = misses * self._random.uniform(*np.transpose(_MISS))
 
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self._simulator.scripted_action(self._target.numpy(), self._error.numpy())
+        action = self._simulator.scripted_action(self._target, self._error)
         return tensordict.set(self.out_keys[0], torch.from_numpy(action))
 
     @property

@@ -85,7 +85,9 @@ class EvaluationEnvs:
         self, task: Task, *, episode_steps: int, workers: int = 2, envs: int = 10, timeout: float = 120.0
     ) -> None:
         self.task, self.episode_steps, self.envs = task, episode_steps, envs
-        make = partial(SteppedEnvs, partial(make_env, task.name, horizon=episode_steps, **task.options))
+        make = partial(
+            SteppedEnvs, partial(make_env, task.name, horizon=episode_steps, privileged=True, **task.options)
+        )
         self._workers: list[Worker] = []
         try:
             for _ in range(max(workers, 1)):
