@@ -106,7 +106,7 @@ def test_actions_beyond_the_bounds_count_as_clipped(style: Any) -> None:
 @pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
 def test_recorded_actions_count_as_imagined_ones(style: Any) -> None:
     """Beyond the bounds they are clipped, and double precision is no other action."""
-    agent = build_agent("dreamer_pcp", reacher_task(), replace(SIZES["debug"], style=style))
+    agent = build_agent("dreamer_pcp", reacher_task(), change(SIZES["debug"], STYLES[style]))
     records, after = random_records(reacher_task(), 2, 4), []
     for action in (4 * records["action"], (4 * records["action"]).clamp(-1, 1).double()):
         torch.manual_seed(1)

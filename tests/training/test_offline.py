@@ -441,10 +441,10 @@ class TestOtherReleases:
         description = self.description()
         description["agent"]["colour"] = "red"
         del description["size"]["architecture"]["belief"]
-        with pytest.raises(SettingsError, match=r"agent\.colour is no setting"):
+        with pytest.raises(CheckpointError, match=r"agent\.colour is no setting"):
             rebuild(description)
         del description["agent"]["colour"]
-        with pytest.raises(SettingsError, match=r"size\.architecture\.belief is missing"):
+        with pytest.raises(CheckpointError, match=r"size\.architecture\.belief is missing"):
             rebuild(description)
 
 
