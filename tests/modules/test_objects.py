@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_ocwm.agents import SIZES
 from torchrl_ocwm.modules import (
     LatentPositionalEncoder,
     LatentSimilarityReward,
@@ -15,6 +16,8 @@ from torchrl_ocwm.modules import (
     ObjectLatentExtractor,
 )
 from torchrl_ocwm.modules.objects import compose
+from torchrl_ocwm.settings import change
+from torchrl_ocwm.testing import STYLES
 
 
 def test_extractor_is_one_mlp_per_id() -> None:
@@ -40,7 +43,7 @@ def test_extractor_of_the_first_instances() -> None:
 
 @pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
 def test_decoder_takes_each_latent_alone(style: Any) -> None:
-    decoder = ObjectDecoder(8, 64, cnn_depth=2, cnn_mults=(1, 2, 2, 2), style=style)
+    decoder = ObjectDecoder(8, 64, change(SIZES["debug"], STYLES[style]).architecture)
     latents = torch.randn(2, 3, 8)
     colours, logits = decoder(latents)
     assert colours.shape == (2, 3, 3, 64, 64)

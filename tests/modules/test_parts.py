@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_ocwm.agents import Architecture
 from torchrl_ocwm.modules import (
     Actor,
     InitialLatent,
@@ -100,7 +101,7 @@ def test_initial_latent_keeps_what_is_there() -> None:
 
 
 def test_vectors_and_positions_in_double_precision() -> None:
-    encoder = ObservationEncoder(16, 3, cnn_depth=2, cnn_mults=(1, 2), mlp_layers=1, mlp_units=4)
+    encoder = ObservationEncoder(16, 3, Architecture(cnn_depth=2, cnn_mults=(1, 2), mlp_layers=1, mlp_units=4))
     pixels, vectors = torch.zeros(2, 3, 16, 16, dtype=torch.uint8), torch.rand(2, 3, dtype=torch.float64)
     torch.testing.assert_close(encoder(pixels, vectors), encoder(pixels, vectors.float()))
     units = WorkspaceUnits((-0.2,), (0.2,))
@@ -108,7 +109,7 @@ def test_vectors_and_positions_in_double_precision() -> None:
 
 
 def test_encoder_needs_the_shapes_it_was_built_for() -> None:
-    encoder = ObservationEncoder(16, 3, cnn_depth=2, cnn_mults=(1, 2), mlp_layers=1, mlp_units=4)
+    encoder = ObservationEncoder(16, 3, Architecture(cnn_depth=2, cnn_mults=(1, 2), mlp_layers=1, mlp_units=4))
     pixels = torch.zeros(2, 3, 16, 16, dtype=torch.uint8)
     with pytest.raises(ValueError, match=r"images of shape .*16, 16.*got \(2, 3, 8, 8\)"):
         encoder(pixels[..., :8, :8], torch.zeros(2, 3))

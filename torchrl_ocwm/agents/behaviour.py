@@ -97,9 +97,7 @@ def make_actor(scene: Scene, goal_features: int) -> ProbabilisticTensorDictSeque
     network = Actor(
         scene.model.latent_features + goal_features,
         scene.task.action,
-        layers=size.mlp_layers,
-        units=size.mlp_units,
-        style=size.style,
+        **size.mlp,
     )
     return ProbabilisticTensorDictSequential(
         TensorDictModule(network, _inputs(goal_features), ["loc", "scale"]),
@@ -117,12 +115,10 @@ def make_critic(scene: Scene, goal_features: int) -> TensorDictSequential:
     """A two-hot critic on ``latent = {state, belief, goal}``, which starts at zero."""
     two_hot, size = SymExpTwoHot(), scene.architecture
     network = make_mlp(
-        size.style,
-        scene.model.latent_features + goal_features,
-        two_hot.num_bins,
-        layers=size.mlp_layers,
-        units=size.mlp_units,
+        in_features=scene.model.latent_features + goal_features,
+        out_features=two_hot.num_bins,
         outscale=0.0,
+        **size.mlp,
     )
     return TensorDictSequential(
         TensorDictModule(network, _inputs(goal_features), ["state_value_logits"]),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 from torchrl_ocwm.envs.task import Task
@@ -72,7 +72,7 @@ class _Observing(WorldModelPart):
             "units": WorkspaceUnits(task.workspace.low, task.workspace.high),
             "observed": self.observed,
             "reward_head": "reward_head" in needs,
-            **asdict(architecture),
+            "architecture": architecture,
         }
 
     def _weights(self, lambda_dynamic: float) -> dict[str, Any]:
@@ -87,9 +87,7 @@ class Flat(_Observing):
 
     def build(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> FlatWorldModel:
         """A world model with one latent."""
-        arguments = self._arguments(task, architecture, needs)
-        del arguments["object_features"], arguments["extractor_units"]
-        return FlatWorldModel(**arguments)
+        return FlatWorldModel(**self._arguments(task, architecture, needs))
 
     def loss(self, model: WorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> WorldModelLoss:
         """What trains it."""

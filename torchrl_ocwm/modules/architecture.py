@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Literal
 
-from torchrl_ocwm.modules.networks import Style
 from torchrl_ocwm.settings import Settings, SettingsError, setting
+
+Style = Literal["dreamer_v3", "dreamer_v2"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,23 +32,28 @@ class Architecture(Settings):
         SettingsError: for numbers that do not fit together.
 
     Examples:
-        >>> Architecture(cnn_depth=8, categoricals=4, classes=4, belief=12, hidden=16, mlp_layers=1, mlp_units=16)
+        >>> Architecture(belief=12)
         Traceback (most recent call last):
         torchrl_ocwm.settings.SettingsError: belief must be a multiple of gru_blocks, got 12 and 8
     """
 
     style: Style = "dreamer_v3"
-    cnn_depth: int = setting(at_least=1)
+    cnn_depth: int = setting(8, at_least=1)
     cnn_mults: tuple[int, ...] = setting((1, 2, 4, 8), at_least=1)
-    categoricals: int = setting(at_least=1)
-    classes: int = setting(at_least=1)
-    belief: int = setting(at_least=1)
-    hidden: int = setting(at_least=1)
+    categoricals: int = setting(16, at_least=1)
+    classes: int = setting(16, at_least=1)
+    belief: int = setting(128, at_least=1)
+    hidden: int = setting(128, at_least=1)
     gru_blocks: int = setting(8, at_least=1)
-    mlp_layers: int = setting(at_least=1)
-    mlp_units: int = setting(at_least=1)
-    object_features: int = setting(256, at_least=1)
-    extractor_units: int = setting(512, at_least=1)
+    mlp_layers: int = setting(2, at_least=1)
+    mlp_units: int = setting(128, at_least=1)
+    object_features: int = setting(128, at_least=1)
+    extractor_units: int = setting(128, at_least=1)
+
+    @property
+    def mlp(self) -> dict[str, Any]:
+        """Arguments of :func:`~torchrl_ocwm.modules.networks.make_mlp` for networks of vectors."""
+        return {"style": self.style, "layers": self.mlp_layers, "units": self.mlp_units}
 
     def check(self) -> None:
         """Numbers that do not fit together, and those that a style does not use."""

@@ -6,8 +6,6 @@ the CNN of the first Dreamers: as near to the paper's networks as TorchRL's part
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from torch import Tensor, nn
 from torchrl.modules import (
@@ -21,10 +19,10 @@ from torchrl.modules import (
     RSSMPriorV3,
 )
 
+from torchrl_ocwm.modules.architecture import Architecture, Style
 from torchrl_ocwm.modules.choices import check_choice
 from torchrl_ocwm.modules.dtypes import unit_image
 
-Style = Literal["dreamer_v3", "dreamer_v2"]
 UNIMIX = 0.01
 
 
@@ -57,69 +55,73 @@ def make_mlp(
     return mlp
 
 
-def make_image_encoder(style: Style, image_size: int, *, depth: int, mults: tuple[int, ...]) -> tuple[nn.Module, int]:
+def make_image_encoder(architecture: Architecture, image_size: int) -> tuple[nn.Module, int]:
     """A CNN for images ``[..., 3, H, W]`` uint8 or float32 in [0, 1], and the number of features that it gives.
 
     Raises:
         ValueError: if the image does not go through the CNN.
     """
-    _check_image_size(style, image_size, mults)
-    if style == "dreamer_v3":
-        encoder = DreamerV3ImageEncoder(3, depth, tuple(mults))
+    depth, mults = architecture.cnn_depth, architecture.cnn_mults
+    _check_image_size(architecture, image_size)
+    if architecture.style == "dreamer_v3":
+        encoder = DreamerV3ImageEncoder(3, depth, mults)
         return encoder, encoder.output_features((3, image_size, image_size))
     return nn.Sequential(_ScaledImage(), ObsEncoder(depth, in_channels=3)), depth * 8 * 2 * 2
 
 
 def make_image_decoder(
-    style: Style, in_features: int, image_size: int, *, depth: int, mults: tuple[int, ...], channels: int = 3
+    architecture: Architecture, in_features: int, image_size: int, *, channels: int = 3
 ) -> nn.Module:
     """A CNN from latents to images ``[..., channels, H, W]`` float32 in [0, 1], unbounded."""
-    _check_image_size(style, image_size, mults)
-    if style == "dreamer_v3":
-        return DreamerV3ImageDecoder(in_features, (channels, image_size, image_size), depth, tuple(mults), num_blocks=1)
+    depth, mults = architecture.cnn_depth, architecture.cnn_mults
+    _check_image_size(architecture, image_size)
+    if architecture.style == "dreamer_v3":
+        return DreamerV3ImageDecoder(in_features, (channels, image_size, image_size), depth, mults, num_blocks=1)
     return _ShiftedImage(ObsDecoder(depth, latent_dim=in_features, out_channels=channels))
 
 
-def make_rssm(
-    style: Style, *, action: int, embedding: int, categoricals: int, classes: int, belief: int, hidden: int, blocks: int
-) -> tuple[RSSMPriorV3, RSSMPosteriorV3]:
-    """Prior and posterior of a discrete RSSM."""
-    check_choice("style", style, Style)
-    v3 = style == "dreamer_v3"
+def make_rssm(architecture: Architecture, *, action: int, embedding: int) -> tuple[RSSMPriorV3, RSSMPosteriorV3]:
+    """Prior and posterior of a discrete RSSM.
+
+    Args:
+        architecture: Their shapes.
+        action: Number of actions A.
+        embedding: Features of an embedded observation.
+    """
+    v3 = architecture.style == "dreamer_v3"
     prior = RSSMPriorV3(
         action_shape=(action,),
         action_dim=action,
-        hidden_dim=hidden,
-        rnn_hidden_dim=belief,
-        num_categoricals=categoricals,
-        num_classes=classes,
+        hidden_dim=architecture.hidden,
+        rnn_hidden_dim=architecture.belief,
+        num_categoricals=architecture.categoricals,
+        num_classes=architecture.classes,
         recurrent_model="block_gru" if v3 else "gru",
-        num_blocks=blocks,
+        num_blocks=architecture.gru_blocks,
         unimix=UNIMIX,
     )
     posterior = RSSMPosteriorV3(
-        hidden_dim=hidden,
-        rnn_hidden_dim=belief,
+        hidden_dim=architecture.hidden,
+        rnn_hidden_dim=architecture.belief,
         obs_embed_dim=embedding,
-        num_categoricals=categoricals,
-        num_classes=classes,
+        num_categoricals=architecture.categoricals,
+        num_classes=architecture.classes,
         use_rms_norm=v3,
         unimix=UNIMIX,
     )
     return prior, posterior
 
 
-def _check_image_size(style: Style, image_size: int, mults: tuple[int, ...]) -> None:
-    check_choice("style", style, Style)
-    if style == "dreamer_v2" and image_size != 64:
+def _check_image_size(architecture: Architecture, image_size: int) -> None:
+    if architecture.style == "dreamer_v2" and image_size != 64:
         raise ValueError(
             f"the CNN of style 'dreamer_v2' takes images of 64 x 64 pixels, got {image_size} x {image_size}"
         )
-    factor = 2 ** len(mults)
-    if image_size % factor:
+    stages = len(architecture.cnn_mults)
+    if image_size % 2**stages:
         raise ValueError(
-            f"a CNN of {len(mults)} stages halves the image {len(mults)} times, which an image of {image_size} x "
-            f"{image_size} pixels does not allow; use a multiple of {factor}"
+            f"a CNN of {stages} stages halves the image {stages} times, which an image of {image_size} x "
+            f"{image_size} pixels does not allow; use a multiple of {2**stages}"
         )
 
 

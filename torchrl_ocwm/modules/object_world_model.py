@@ -7,8 +7,9 @@ from typing import Any
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 
+from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.latent import LatentOfImages
-from torchrl_ocwm.modules.networks import Style, make_mlp
+from torchrl_ocwm.modules.networks import make_mlp
 from torchrl_ocwm.modules.objects import LatentPositionalEncoder, ObjectDecoder, ObjectLatentExtractor, compose
 from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.world_model import VectorName, WorldModel, key_at, latent_at
@@ -24,14 +25,8 @@ class ObjectWorldModel(WorldModel):
         image_size: Height and width of the images, pixels.
         objects: Number of objects O; the background is one instance more.
         observed: Vectors that the encoder sees.
-        object_features: Features of an object latent L.
-        extractor_units: Units of the two hidden layers of the extractor.
         positional_encoder: Whether to learn the latent of an object at a position (LCP).
-        cnn_depth: Channels of the CNNs' first stage before its multiplier.
-        cnn_mults: Channel multiplier of each stage.
-        mlp_layers: Hidden layers of the vector encoder, decoders and heads.
-        mlp_units: Units of each.
-        style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
+        architecture: Shapes of the networks.
         kwargs: The other arguments of :class:`~torchrl_ocwm.modules.WorldModel`.
 
     Raises:
@@ -52,48 +47,38 @@ class ObjectWorldModel(WorldModel):
         image_size: int,
         objects: int,
         observed: tuple[VectorName, ...],
-        object_features: int,
-        extractor_units: int,
         positional_encoder: bool,
-        cnn_depth: int,
-        cnn_mults: tuple[int, ...],
-        mlp_layers: int,
-        mlp_units: int,
-        style: Style = "dreamer_v3",
+        architecture: Architecture,
         **kwargs: Any,
     ) -> None:
         if "object_position" not in observed:
             raise ValueError(
                 "an object-centric world model learns from object positions: 'object_position' in `observed`"
             )
-        mlp: dict[str, Any] = {"style": style, "layers": mlp_layers, "units": mlp_units}
-        cnn: dict[str, Any] = {"style": style, "cnn_depth": cnn_depth, "cnn_mults": cnn_mults}
         super().__init__(
             image_size=image_size,
             objects=objects,
             observed=observed,
             decoded=tuple(name for name in observed if name != "object_position"),
-            mlp_layers=mlp_layers,
-            mlp_units=mlp_units,
-            **cnn,
+            architecture=architecture,
             **kwargs,
         )
+        features, dim = architecture.object_features, self.units.dim
         self.objects = objects
         self.extractor = ObjectLatentExtractor(
             self.latent_features,
             instances=objects + 1,
-            features=object_features,
-            units=extractor_units,
-            style=style,
+            features=features,
+            units=architecture.extractor_units,
+            style=architecture.style,
         )
-        self.object_decoder = ObjectDecoder(object_features, image_size, **cnn)
-        self.position_decoder = _ObjectPositions(
-            objects, make_mlp(in_features=object_features, out_features=self.units.dim, **mlp)
-        )
+        self.object_decoder = ObjectDecoder(features, image_size, architecture)
+        positions = make_mlp(in_features=features, out_features=dim, **architecture.mlp)
+        self.position_decoder = _ObjectPositions(objects, positions)
         self.positional_encoder = None
         if positional_encoder:
             self.positional_encoder = LatentPositionalEncoder(
-                self.units.dim, objects=objects, features=object_features, **mlp
+                dim, objects=objects, features=features, **architecture.mlp
             )
 
     def vectors(self, *at: str) -> list[TensorDictModuleBase]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from torchrl_ocwm.modules.networks import Style, make_image_decoder, make_mlp
+from torchrl_ocwm.modules.architecture import Architecture, Style
+from torchrl_ocwm.modules.networks import make_image_decoder, make_mlp
 
 
 class ObjectLatentExtractor(nn.Module):
@@ -62,31 +63,21 @@ class ObjectDecoder(nn.Module):
     Args:
         features: Features of an object latent L.
         image_size: Height and width of the images, pixels.
-        cnn_depth: Channels of the last stage before its multiplier.
-        cnn_mults: Channel multiplier of each stage.
-        style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
+        architecture: Shapes of the CNN.
 
     Called with object latents ``[..., N, L]``; returns colours ``[..., N, 3, H, W]`` in [0, 1], unbounded, and mask
     logits ``[..., N, H, W]``.
 
     Examples:
-        >>> decoder = ObjectDecoder(8, 16, cnn_depth=4, cnn_mults=(1, 2))
+        >>> decoder = ObjectDecoder(8, 16, Architecture(cnn_depth=4, cnn_mults=(1, 2)))
         >>> colours, logits = decoder(torch.zeros(5, 3, 8))
         >>> colours.shape, logits.shape
         (torch.Size([5, 3, 3, 16, 16]), torch.Size([5, 3, 16, 16]))
     """
 
-    def __init__(
-        self,
-        features: int,
-        image_size: int,
-        *,
-        cnn_depth: int,
-        cnn_mults: tuple[int, ...],
-        style: Style = "dreamer_v3",
-    ) -> None:
+    def __init__(self, features: int, image_size: int, architecture: Architecture) -> None:
         super().__init__()
-        self.cnn = make_image_decoder(style, features, image_size, depth=cnn_depth, mults=cnn_mults, channels=4)
+        self.cnn = make_image_decoder(architecture, features, image_size, channels=4)
 
     def forward(self, object_latent: Tensor) -> tuple[Tensor, Tensor]:
         colours, mask_logits = self.cnn(object_latent).split([3, 1], -3)

@@ -7,8 +7,9 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 from torchrl.objectives import symlog
 
+from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.dtypes import unit_image
-from torchrl_ocwm.modules.networks import Style, make_image_encoder, make_mlp
+from torchrl_ocwm.modules.networks import make_image_encoder, make_mlp
 
 
 class ObservationEncoder(nn.Module):
@@ -17,11 +18,7 @@ class ObservationEncoder(nn.Module):
     Args:
         image_size: Height and width of the image, pixels.
         vector_features: Number of values in all vectors together; 0 for images alone.
-        cnn_depth: Channels of the first stage before its multiplier.
-        cnn_mults: Channel multiplier of each stage; each halves the image.
-        mlp_layers: Hidden layers of the MLP.
-        mlp_units: Units of each.
-        style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
+        architecture: Shapes of CNN and MLP.
 
     Called with ``pixels`` ``[..., 3, H, W]``, uint8 or floating point in [0, 1], and vectors ``[..., any]``;
     returns ``[..., features]`` float32. Without vectors their part of the embedding is zero (:meth:`image_alone`).
@@ -30,30 +27,20 @@ class ObservationEncoder(nn.Module):
         ValueError: if the image cannot be halved by every stage; when called, for inputs of other shapes.
 
     Examples:
-        >>> encoder = ObservationEncoder(16, 5, cnn_depth=4, cnn_mults=(1, 2), mlp_layers=1, mlp_units=8)
+        >>> encoder = ObservationEncoder(16, 5, Architecture(cnn_depth=4, cnn_mults=(1, 2)))
         >>> pixels = torch.zeros(3, 3, 16, 16, dtype=torch.uint8)
         >>> encoder(pixels, torch.zeros(3, 4), torch.zeros(3, 1)).shape == (3, encoder.features)
         True
     """
 
-    def __init__(
-        self,
-        image_size: int,
-        vector_features: int,
-        *,
-        cnn_depth: int,
-        cnn_mults: tuple[int, ...],
-        mlp_layers: int,
-        mlp_units: int,
-        style: Style = "dreamer_v3",
-    ) -> None:
+    def __init__(self, image_size: int, vector_features: int, architecture: Architecture) -> None:
         super().__init__()
-        self.cnn, self.features = make_image_encoder(style, image_size, depth=cnn_depth, mults=cnn_mults)
-        self.image_size, self.vector_features, self.mlp_units = image_size, vector_features, mlp_units
+        self.cnn, self.features = make_image_encoder(architecture, image_size)
+        self.image_size, self.vector_features, self.mlp_units = image_size, vector_features, architecture.mlp_units
         self.mlp = None
         if vector_features:
-            self.mlp = make_mlp(style, vector_features, None, layers=mlp_layers, units=mlp_units)
-            self.features += mlp_units
+            self.mlp = make_mlp(in_features=vector_features, out_features=None, **architecture.mlp)
+            self.features += self.mlp_units
 
     def forward(self, pixels: Tensor, *vectors: Tensor) -> Tensor:
         """The embedding of an image and vectors."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -11,8 +12,9 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.modules import RSSMRolloutV3, RSSMStateEstimatorV3, SymExpTwoHot
 
+from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.latent import InitialLatent, LatentOfImages
-from torchrl_ocwm.modules.networks import Style, make_image_decoder, make_mlp, make_rssm
+from torchrl_ocwm.modules.networks import make_image_decoder, make_mlp, make_rssm
 from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.units import WorkspaceUnits
 
@@ -38,16 +40,7 @@ class WorldModel(nn.Module, ABC):
         observed: Vectors that the encoder sees.
         decoded: Those of them that are decoded from the latent of the scene.
         reward_head: Whether to predict the reward.
-        cnn_depth: Channels of the CNN's first stage before its multiplier.
-        cnn_mults: Channel multiplier of each stage.
-        categoricals: Categorical variables of the stochastic state.
-        classes: Classes of each.
-        belief: Features of the deterministic state H, a multiple of ``gru_blocks``.
-        hidden: Units in the layers of the RSSM.
-        gru_blocks: Blocks of the recurrent layer.
-        mlp_layers: Hidden layers of the vector encoder, decoders and heads.
-        mlp_units: Units of each.
-        style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
+        architecture: Shapes of the networks.
     """
 
     def __init__(
@@ -61,47 +54,21 @@ class WorldModel(nn.Module, ABC):
         observed: tuple[VectorName, ...],
         decoded: tuple[VectorName, ...],
         reward_head: bool,
-        cnn_depth: int,
-        cnn_mults: tuple[int, ...],
-        categoricals: int,
-        classes: int,
-        belief: int,
-        hidden: int,
-        gru_blocks: int,
-        mlp_layers: int,
-        mlp_units: int,
-        style: Style = "dreamer_v3",
+        architecture: Architecture,
     ) -> None:
         super().__init__()
-        self.action, self.state, self.belief = action, categoricals * classes, belief
+        self.action, self.belief = action, architecture.belief
+        self.state = architecture.categoricals * architecture.classes
         self.units, self.observed = units, tuple(observed)
         sizes = {"proprio": proprio, "object_position": objects * units.dim, "goal_position": units.dim}
         vectors = {name: sizes[name] for name in self.observed}
-        mlp = {"layers": mlp_layers, "units": mlp_units}
-        self.encoder = ObservationEncoder(
-            image_size,
-            sum(vectors.values()),
-            cnn_depth=cnn_depth,
-            cnn_mults=cnn_mults,
-            mlp_layers=mlp_layers,
-            mlp_units=mlp_units,
-            style=style,
-        )
-        self.prior, self.posterior = make_rssm(
-            style,
-            action=action,
-            embedding=self.encoder.features,
-            categoricals=categoricals,
-            classes=classes,
-            belief=belief,
-            hidden=hidden,
-            blocks=gru_blocks,
-        )
-        latent = self.latent_features
-        self.vector_decoders = nn.ModuleDict({name: make_mlp(style, latent, vectors[name], **mlp) for name in decoded})
-        self.continue_head = make_mlp(style, latent, 1, layers=1, units=mlp_units)
+        mlp = partial(make_mlp, in_features=self.latent_features, **architecture.mlp)
+        self.encoder = ObservationEncoder(image_size, sum(vectors.values()), architecture)
+        self.prior, self.posterior = make_rssm(architecture, action=action, embedding=self.encoder.features)
+        self.vector_decoders = nn.ModuleDict({name: mlp(out_features=vectors[name]) for name in decoded})
+        self.continue_head = mlp(out_features=1, layers=1)
         self.two_hot = SymExpTwoHot()
-        self.reward_head = make_mlp(style, latent, self.two_hot.num_bins, outscale=0.0, **mlp) if reward_head else None
+        self.reward_head = mlp(out_features=self.two_hot.num_bins, outscale=0.0) if reward_head else None
 
     @property
     def latent_features(self) -> int:
@@ -233,9 +200,7 @@ class FlatWorldModel(WorldModel):
     Args:
         image_size: Height and width of the images, pixels.
         observed: Vectors that the encoder sees and the decoder reconstructs.
-        cnn_depth: Channels of the CNN's first stage before its multiplier.
-        cnn_mults: Channel multiplier of each stage.
-        style: Which layers (:mod:`torchrl_ocwm.modules.networks`).
+        architecture: Shapes of the networks.
         kwargs: The other arguments of :class:`WorldModel`.
 
     Examples:
@@ -252,16 +217,12 @@ class FlatWorldModel(WorldModel):
         *,
         image_size: int,
         observed: tuple[VectorName, ...],
-        cnn_depth: int,
-        cnn_mults: tuple[int, ...],
-        style: Style = "dreamer_v3",
+        architecture: Architecture,
         **kwargs: Any,
     ) -> None:
-        cnn: dict[str, Any] = {"cnn_depth": cnn_depth, "cnn_mults": cnn_mults}
-        super().__init__(image_size=image_size, observed=observed, decoded=observed, style=style, **cnn, **kwargs)
-        self.image_decoder = make_image_decoder(
-            style, self.latent_features, image_size, depth=cnn_depth, mults=cnn_mults
-        )
+        scene: dict[str, Any] = {"image_size": image_size, "observed": observed, "architecture": architecture}
+        super().__init__(decoded=observed, **scene, **kwargs)
+        self.image_decoder = make_image_decoder(architecture, self.latent_features, image_size)
 
     def images(self, *at: str) -> list[TensorDictModuleBase]:
         """``reco_pixels``."""
