@@ -66,7 +66,7 @@ def test_an_agent_has_no_goals_that_nobody_saw(make_agent: Any, records: TensorD
     records["next", "object_visible"][:, 3:] = False
     agent = make_agent(name, {"behaviours.reach.goals": source})
     after = agent.loss.model_loss(records.select(*agent.loss.in_keys))[1]["next"]
-    goals = agent.loss.imagination_start(after)["latent", "goal"]
+    goals = agent.behaviour().loss.imagination_start(after)["latent", "goal"]
     known = UnitRMS()(after["image_latent"][:, :, 0]) if name == "focus_lcp" else after["object_units"]
     among = (goals.unsqueeze(1) == known[:, 3:].flatten(0, 1)).all(-1).any(1)
     seen = (goals.unsqueeze(1) == known[:, :3].flatten(0, 1)).all(-1).any(1)
@@ -196,7 +196,7 @@ def test_lengths_stay_where_training_and_reward_compare_them(make_agent: Any, re
 @pytest.mark.usefixtures("no_noise")
 @pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])
 def test_goal_images_in_floating_point(style: Any) -> None:
-    policy = build_agent("focus_lcp", reacher_task(), replace(SIZES["debug"], style=style)).policy()
+    policy = build_agent("focus_lcp", reacher_task(), change(SIZES["debug"], STYLES[style])).policy()
     image = random_records(reacher_task(), 4, 1, seed=1)["next", "pixels"][:, 0]
     goals = [
         policy(observation(4).set("goal", TensorDict({"pixels": pixels}, [4])))["latent", "goal"]
