@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
+from torch import nn
 
 from torchrl_ocwm.agents import AGENTS, SIZES, build_agent
 from torchrl_ocwm.modules.networks import make_image_decoder, make_image_encoder, make_mlp
@@ -54,3 +57,41 @@ def test_every_size_builds(name: str) -> None:
     architecture = SIZES[name].architecture
     assert agent.model.belief == architecture.belief
     assert agent.model.state == architecture.categoricals * architecture.classes
+
+
+V3 = {"DreamerV3MLP", "DreamerV3ImageEncoder", "DreamerV3ImageDecoder", "_DreamerV3BlockGRU", "_DreamerV3RMSNorm"}
+V2 = {"MLP", "ObsEncoder", "ObsDecoder", "GRUCell", "ELU"}
+
+
+@pytest.mark.parametrize("name", ["dreamer", "focus_lcp"])
+@pytest.mark.parametrize(("style", "used", "other"), [("dreamer_v3", V3, V2), ("dreamer_v2", V2, V3)])
+def test_every_network_has_the_style(name: str, style: Any, used: set[str], other: set[str]) -> None:
+    agent = build_agent(name, reacher_task(), change(SIZES["debug"], STYLES[style]))
+    layers = {type(module).__name__ for module in agent.modules()}
+    assert used <= layers
+    assert not other & layers
+
+
+def widths(module: nn.Module) -> list[int]:
+    return [layer.out_features for layer in module.modules() if isinstance(layer, nn.Linear)]
+
+
+def test_every_number_reaches_its_network() -> None:
+    numbers = {"mlp_layers": 3, "mlp_units": 20, "object_features": 12, "extractor_units": 24, "hidden": 18}
+    size = change(SIZES["debug"], {f"architecture.{name}": number for name, number in numbers.items()})
+    model = build_agent("focus_lcp", reacher_task(), size).model
+    assert widths(model.extractor) == [24, 24, 12]
+    assert widths(model.positional_encoder) == [20, 20, 20, 12]
+    assert widths(model.position_decoder) == [20, 20, 20, 2]
+    assert widths(model.vector_decoders["proprio"]) == [20, 20, 20, 5]
+    assert widths(model.encoder.mlp) == [20, 20, 20]
+    assert widths(model.continue_head) == [20, 1]
+    assert 18 in widths(model.prior)
+    assert 18 in widths(model.posterior)
+    assert model.prior.unimix == model.posterior.unimix == 0.01
+    assert widths(build_agent("dreamer", reacher_task(), size).model.reward_head) == [20, 20, 20, 255]
+
+
+def test_the_reward_head_starts_at_zero() -> None:
+    head = build_agent("dreamer", reacher_task(), "debug").model.reward_head
+    assert head(torch.randn(5, 16), torch.randn(5, 16)).abs().max() == 0
