@@ -116,7 +116,7 @@ def check_values(records: TensorDictBase, episode_lengths: Sequence[int], task: 
     _check_ends(records["next"], episode_lengths, where)
     last = torch.tensor(episode_lengths).cumsum(0) - 1
     first = last + 1 - torch.tensor(episode_lengths)
-    seen = [records["next", "pixels"][frames].flatten(1).any(1) for frames in (first, (first + last) // 2, last)]
+    seen = [(records["next", "pixels"][frames] != 0).flatten(1).any(1) for frames in (first, (first + last) // 2, last)]
     black = (~torch.stack(seen).any(0)).nonzero().flatten().tolist()
     if black:
         raise DatasetError(f"{where}next/pixels: the images of episode {black[0]} are black; the frames were lost")
