@@ -68,29 +68,75 @@ def test_shapes_and_types_are_those_of_what_is_collected():
 
 
 REFUSED = {
-    "masks of three values": ("masks", lambda x: x.to(torch.uint8).index_fill_(0, torch.tensor(2), 7), "next/masks: torch.uint8"),
-    "masks 0 and 2": ("masks", lambda x: 2 * x.to(torch.uint8), "next/masks: .* with values up to 2; expected bool"),
-    "masks of probabilities": ("masks", lambda x: 0.3 * x, "next/masks: torch.float32 with values up to 0.3"),
-    "masks negative": ("masks", lambda x: -x.float(), "next/masks"),
-    "masks not a number": ("masks", lambda x: x / 0.0, "next/masks"),
-    "images any float": ("pixels", lambda x: (x / 255 + 0.001).clamp(0, 1), "next/pixels: .*not multiples of 1/255"),
-    "images float 255": ("pixels", lambda x: x.float(), r"next/pixels: .*floating images lie in \[0, 1\]"),
-    "images negative": ("pixels", lambda x: x / 255 - 0.5, r"next/pixels: .*floating images lie in \[0, 1\]"),
-    "images bfloat16": ("pixels", lambda x: (x / 255).bfloat16(), "next/pixels: expected uint8 images"),
-    "images int64": ("pixels", lambda x: x.long(), "next/pixels: expected uint8 images of 0 to 255, got torch.int64"),
-    "images H x W x 3": ("pixels", lambda x: x.permute(0, 2, 3, 1), r"next/pixels: has shape \(16, 16, 3\), channels last"),
-    "images of 20": ("pixels", lambda x: x.new_ones(6, 3, 20, 20), r"shape \(3, 20, 20\) per record, the task says \(3, 16, 16\)"),
-    "images black": ("pixels", lambda x: x * 0, "next/pixels: the images of episode 0 are black"),
-    "no object axis": ("object_position", lambda x: x[:, 0], r"next/object_position: has shape \(2,\) per record, .* \(1, 2\)"),
-    "millimetres": ("object_position", lambda x: 1000 * x, "next/object_position: .*far outside the workspace.*metres"),
-    "far goal": ("goal_position", lambda x: 1000 * x, "next/goal_position: .*far outside the workspace.*metres"),
-    "positions of integers": ("object_position", lambda x: x.long(), "next/object_position: expected float32, got torch.int64"),
-    "position lost": ("object_position", lambda x: x / 0 * 0, "NaN or infinity in 'next/object_position'"),
-    "proprio too large": ("proprio", lambda x: x.double() * 1e60, "NaN or infinity in 'next/proprio'"),
-    "proprio of another arm": ("proprio", lambda x: x[:, :3], r"next/proprio: has shape \(3,\) per record"),
-    "done at the start": ("done", lambda x: x | (torch.arange(6) == 0).unsqueeze(-1), "next/done: must be set at the last"),
-    "never done": ("done", lambda x: x & False, "next/done: must be set at the last record"),
-    "terminated before": ("terminated", lambda x: x | True, "next/terminated: is set where next/done is not"),
+    "masks of three values":
+        ("masks", lambda x: x.to(torch.uint8).index_fill_(0, torch.tensor(2), 7),
+         "next/masks: torch.uint8"),
+    "masks 0 and 2":
+        ("masks", lambda x: 2 * x.to(torch.uint8),
+         "next/masks: .* with values up to 2; expected bool"),
+    "masks of probabilities":
+        ("masks", lambda x: 0.3 * x,
+         "next/masks: torch.float32 with values up to 0.3"),
+    "masks negative":
+        ("masks", lambda x: -x.float(),
+         "next/masks"),
+    "masks not a number":
+        ("masks", lambda x: x / 0.0,
+         "next/masks"),
+    "images any float":
+        ("pixels", lambda x: (x / 255 + 0.001).clamp(0, 1),
+         "next/pixels: .*not multiples of 1/255"),
+    "images float 255":
+        ("pixels", lambda x: x.float(),
+         r"next/pixels: .*floating images lie in \[0, 1\]"),
+    "images negative":
+        ("pixels", lambda x: x / 255 - 0.5,
+         r"next/pixels: .*floating images lie in \[0, 1\]"),
+    "images bfloat16":
+        ("pixels", lambda x: (x / 255).bfloat16(),
+         "next/pixels: expected uint8 images"),
+    "images int64":
+        ("pixels", lambda x: x.long(),
+         "next/pixels: expected uint8 images of 0 to 255, got torch.int64"),
+    "images H x W x 3":
+        ("pixels", lambda x: x.permute(0, 2, 3, 1),
+         r"next/pixels: has shape \(16, 16, 3\), channels last"),
+    "images of 20":
+        ("pixels", lambda x: x.new_ones(6, 3, 20, 20),
+         r"shape \(3, 20, 20\) per record, the task says \(3, 16, 16\)"),
+    "images black":
+        ("pixels", lambda x: x * 0,
+         "next/pixels: the images of episode 0 are black"),
+    "no object axis":
+        ("object_position", lambda x: x[:, 0],
+         r"next/object_position: has shape \(2,\) per record, .* \(1, 2\)"),
+    "millimetres":
+        ("object_position", lambda x: 1000 * x,
+         "next/object_position: .*far outside the workspace.*metres"),
+    "far goal":
+        ("goal_position", lambda x: 1000 * x,
+         "next/goal_position: .*far outside the workspace.*metres"),
+    "positions of integers":
+        ("object_position", lambda x: x.long(),
+         "next/object_position: expected float32, got torch.int64"),
+    "position lost":
+        ("object_position", lambda x: x / 0 * 0,
+         "NaN or infinity in 'next/object_position'"),
+    "proprio too large":
+        ("proprio", lambda x: x.double() * 1e60,
+         "NaN or infinity in 'next/proprio'"),
+    "proprio of another arm":
+        ("proprio", lambda x: x[:, :3],
+         r"next/proprio: has shape \(3,\) per record"),
+    "done at the start":
+        ("done", lambda x: x | (torch.arange(6) == 0).unsqueeze(-1),
+         "next/done: must be set at the last"),
+    "never done":
+        ("done", lambda x: x & False,
+         "next/done: must be set at the last record"),
+    "terminated before":
+        ("terminated", lambda x: x | True,
+         "next/terminated: is set where next/done is not"),
 }  # fmt: skip
 
 
