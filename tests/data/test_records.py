@@ -85,3 +85,28 @@ def test_episode_that_does_not_end_once_at_its_end(ends, found):
     bad["next", "done"][ends] = True
     with pytest.raises(ValueError, match=f"of 3 steps must end at its last step and only there, ends at {found}"):
         episode_to_records(bad)
+
+
+def test_frames_under_next_only():
+    """Their first frame would be zeros."""
+    bad = episode().exclude("pixels", "masks")
+    with pytest.raises(ValueError, match=r"has \['pixels', 'masks'\] under 'next' only, so that its first frame lacks"):
+        episode_to_records(bad)
+
+
+def test_what_is_earned_has_no_first_value():
+    assert episode_to_records(episode().exclude("done", "terminated"))["next", "reward"][0] == 0
+
+
+def test_first_frame_of_another_kind():
+    """Images in [0, 1] at the root would become zeros among bytes."""
+    bad = episode()
+    bad["pixels"] = bad["pixels"] / 255
+    with pytest.raises(
+        ValueError, match=r"'pixels' is torch.float32 \(3, 1\) at the root and torch.uint8 \(3, 1\) under"
+    ):
+        episode_to_records(bad)
+    bad = episode()
+    bad["object_position"] = bad["object_position"].expand(3, 2)
+    with pytest.raises(ValueError, match=r"'object_position' is torch.float32 \(3, 2\) at the root"):
+        episode_to_records(bad)

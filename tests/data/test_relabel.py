@@ -1,11 +1,16 @@
 """Fresh goals for stored sequences, and the rewards that belong to them."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import Compose
 
-from torchrl_ocwm.data import RelabelGoals
+from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals, make_replay_buffer
 from torchrl_ocwm.envs import Workspace
+from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
+from torchrl_ocwm.training.settings import Training
 
 WORKSPACE = Workspace(low=(-0.2, 0.1), high=(0.2, 0.5))
 
@@ -70,3 +75,66 @@ def test_uniform_goals_fill_the_workspace():
 def test_unknown_kind_of_goals():
     with pytest.raises(ValueError, match="goals must be 'auto', 'uniform' or 'stored', got 'hindsight'"):
         RelabelGoals(WORKSPACE, goals="hindsight")
+
+
+# Data whose images show the goal.
+
+
+def sampled(dataset: EpisodeDataset, relabel: RelabelGoals, *, inside: bool = False) -> TensorDict:
+    transform = Compose(relabel) if inside else relabel
+    return make_replay_buffer(dataset, batch_size=8, slice_len=4, transform=transform).sample()
+
+
+def holds_stored_goals(dataset: EpisodeDataset, batch: TensorDict) -> bool:
+    stored = {tuple(goal) for goal in dataset.records["next", "goal_position"].tolist()}
+    return {tuple(goal) for goal in batch["next", "goal_position"].flatten(0, 1).tolist()} <= stored
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    return random_dataset(tmp_path_factory.mktemp("plain") / "data", reacher_task(16))
+
+
+@pytest.fixture(scope="module")
+def with_targets(tmp_path_factory):
+    task = replace(reacher_task(16), options={"virtual_target": 7})
+    return random_dataset(tmp_path_factory.mktemp("targets") / "data", task)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_goals_are_drawn_unless_the_images_show_them(plain, with_targets, inside):
+    assert Training().goals == "auto"
+    batch = sampled(plain, RelabelGoals(reacher_task().workspace), inside=inside)
+    assert not holds_stored_goals(plain, batch)
+    batch = sampled(with_targets, RelabelGoals(reacher_task().workspace, goals=Training().goals), inside=inside)
+    assert holds_stored_goals(with_targets, batch)
+    distance = (batch["next", "object_position"][..., 0, :] - batch["next", "goal_position"]).norm(dim=-1)
+    assert torch.allclose(batch["next", "reward"].squeeze(-1), -distance)
+
+
+def test_drawn_goals_are_refused_where_the_images_show_others(with_targets):
+    message = f"{with_targets.path}: its images show the goals of its episodes .*use goals='stored'"
+    with pytest.raises(DatasetError, match=message):
+        sampled(with_targets, RelabelGoals(reacher_task().workspace, goals="uniform"))
+    batch = sampled(with_targets, RelabelGoals(reacher_task().workspace, goals="stored"))
+    assert holds_stored_goals(with_targets, batch)
+
+
+@pytest.mark.parametrize(
+    ("options", "shown"), [({}, False), ({"virtual_target": 0}, False), ({"virtual_target": 5}, True)]
+)
+def test_which_images_show_the_goal(tmp_path, options, shown):
+    dataset = random_dataset(tmp_path / "data", replace(reacher_task(16), options=options))
+    assert dataset.images_show_goal is shown
+
+
+def test_stored_goals_where_there_are_none(tmp_path):
+    task = reacher_task(16)
+    records = random_records(task, 1, 6)[0].exclude(("next", "goal_position"))
+    records["next", "done"][-1] = True
+    metadata = {"environment": task.name, "options": {}, "task": task.to_dict()}
+    with EpisodeDataset.create(tmp_path / "data", example=records[0], metadata=metadata) as dataset:
+        dataset.append(records)
+    with pytest.raises(DatasetError, match="holds no goals .*to keep; use goals='uniform'"):
+        sampled(dataset, RelabelGoals(task.workspace, goals="stored"))
+    assert sampled(dataset, RelabelGoals(task.workspace))["next", "goal_position"].shape == (8, 4, 2)

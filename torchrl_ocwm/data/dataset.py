@@ -431,7 +431,7 @@ def _write(file: Path, offset: int, frames: memoryview) -> None:
 
 
 def _bytes(frames: Tensor) -> memoryview:
-    return memoryview(frames.detach().cpu().contiguous().flatten().view(torch.uint8).numpy())
+    return frames.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data
 
 
 def _not_finite(records: TensorDictBase) -> str | None:

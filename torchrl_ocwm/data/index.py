@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from math import prod
 from pathlib import Path
@@ -159,7 +159,7 @@ def _mapping(item: Check) -> Check:
     return check
 
 
-def _fields(required: dict[str, Check], optional: dict[str, Check], *, others: bool = False) -> Check:
+def _fields(required: Mapping[str, Check], optional: Mapping[str, Check], *, others: bool = False) -> Check:
     """A mapping with these fields; with other ones only if so said."""
 
     def check(name: str, value: Any) -> None:
