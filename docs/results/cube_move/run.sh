@@ -17,8 +17,8 @@ collect() {  # policy, steps in all
 }
 train() {  # agent, updates in all, share of the learning rates that is left
   python examples/train_offline.py agent="$1" env=cube_move size="$size" dataset=$data output="$(run "$1")" \
-    training.updates="$2" training.final_lr="$3" training.eval_interval=$((updates / 2)) \
-    training.threads=1 training.device="$device"
+    training.updates="$2" training.final_lr="$3" "training.changed=[dataset,final_lr]" \
+    training.eval_interval=$((updates / 2)) training.threads=1 training.device="$device"
 }
 run() {
   echo "$runs/$1/$size/seed_0"
