@@ -197,7 +197,7 @@ def test_unknown_name_lists_the_others(make):
 
 
 @pytest.mark.parametrize("make", [make_env, make_task])
-@pytest.mark.parametrize("missing", ["gymnasium", "dm_control"])
+@pytest.mark.parametrize("missing", ["gymnasium", "mujoco", "dm_control"])
 def test_missing_simulator_says_what_to_install(monkeypatch, make, missing):
     monkeypatch.setattr(registry, "find_spec", lambda name: None if name == missing else True)
     with pytest.raises(
