@@ -39,6 +39,10 @@ clean:
 	rm -rf $(VENV) $(DEMO)
 
 $(INSTALLED): pyproject.toml constraints.txt
+	@version=$$($(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])'); \
+	case "$$version" in 3.10|3.11|3.12) ;; *) \
+		echo "make needs Python 3.10, 3.11 or 3.12, for which all simulators have packages; $(PYTHON) is $$version." \
+			"Choose another one: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1 ;; esac
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	@touch $@

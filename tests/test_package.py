@@ -13,6 +13,7 @@ import pytest
 import torchrl_ocwm
 from torchrl_ocwm import check
 from torchrl_ocwm.envs import ENVIRONMENTS
+from torchrl_ocwm.envs.missing import missing, needs
 
 OURS = tuple(ENVIRONMENTS)  # the documentation adds one of its own
 
@@ -96,11 +97,67 @@ def test_check_finds_the_renderer() -> None:
     assert done.stdout.splitlines() == [f"{name}: simulates and renders" for name in OURS], done.stderr
 
 
+def run_make(folder: Path, version: str) -> subprocess.CompletedProcess[str]:
+    """``make check`` where the interpreter says that it has some version."""
+    root = Path(torchrl_ocwm.__file__).parents[1]
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        (folder / name).write_text((root / name).read_text())
+    interpreter = folder / "python"
+    interpreter.write_text(
+        f'#!/bin/sh\ncase "$*" in *venv*) echo "makes an environment"; exit 3;; esac\necho {version}\n'
+    )
+    interpreter.chmod(0o755)
+    return subprocess.run(
+        ["make", f"PYTHON={interpreter}", "check"], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize("version", ["3.9", "3.13", "3.14"])
+def test_make_says_which_versions_of_python_it_takes(tmp_path: Path, version: str) -> None:
+    done = run_make(tmp_path, version)
+    assert done.returncode != 0
+    assert f"make needs Python 3.10, 3.11 or 3.12, for which all simulators have packages; {tmp_path}" in done.stderr
+    assert f"is {version}. Choose another one: make PYTHON=python3.12 check" in done.stderr
+    assert "makes an environment" not in done.stdout
+
+
+def test_make_goes_on_with_a_version_that_it_takes(tmp_path: Path) -> None:
+    assert "makes an environment" in run_make(tmp_path, "3.10").stdout
+
+
+@pytest.mark.parametrize("extra", ["robosuite", "dm-control"])
+def test_a_simulator_without_packages_for_this_python(monkeypatch: pytest.MonkeyPatch, extra: str) -> None:
+    module = extra.replace("-", "_")
+    monkeypatch.setattr(sys, "version_info", (3, 12, 1))
+    assert f"pip install 'torchrl-ocwm[{extra}]'" in str(missing("an environment", module, extra))
+    monkeypatch.setattr(sys, "version_info", (3, 13, 0))
+    assert "none for Python 3.13 and newer; use 3.10, 3.11 or 3.12" in str(missing("an environment", module, extra))
+    assert f"pip install 'torchrl-ocwm[{extra}]'" in str(missing("an environment", "gymnasium", extra))
+
+
+def test_a_library_of_the_system_that_is_missing() -> None:
+    message = "Cube move needs a library .*libGL.so.1: cannot open.*apt-get install libgl1 .*opencv-python-headless"
+    with pytest.raises(ImportError, match=message) as caught, needs("Cube move", "robosuite"):
+        raise ImportError("libGL.so.1: cannot open shared object file: No such file or directory")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("module", ["mujoco", "gymnasium"])
+def test_classes_without_their_packages_name_them(module: str) -> None:
+    code = f"import sys; sys.modules[{module!r}] = None; from torchrl_ocwm.envs import PositioningEnv"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    last = done.stderr.splitlines()[-1]
+    assert f"needs {module}, which is not installed: pip install 'torchrl-ocwm[dm-control]'" in last
+
+
 def test_check_goes_on_without_a_simulator(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     missing = ENVIRONMENTS["cube_move"]._replace(module="no_such_simulator")
     monkeypatch.setitem(ENVIRONMENTS, "cube_move", missing)
     assert check.main() == 0
-    assert "cube_move: not installed, pip install 'torchrl-ocwm[robosuite]'" in capsys.readouterr().out
+    assert (
+        "cube_move needs no_such_simulator, which is not installed: pip install 'torchrl-ocwm[robosuite]'"
+        in capsys.readouterr().out
+    )
 
 
 def test_unknown_attribute() -> None:

@@ -10,14 +10,15 @@ def main() -> int:
     """Make each environment whose simulator is installed, and say how it went on one line each."""
     try:
         from torchrl_ocwm.envs import ENVIRONMENTS, make_env
+        from torchrl_ocwm.envs.missing import missing
 
         for name, environment in ENVIRONMENTS.items():
             if find_spec(environment.module) is None:
-                sys.stdout.write(f"{name}: not installed, pip install 'torchrl-ocwm[{environment.extra}]'\n")
+                sys.stdout.write(f"{missing(name, environment.module, environment.extra)}\n")
                 continue
             make_env(name).close()
             sys.stdout.write(f"{name}: simulates and renders\n")
-    except (ModuleNotFoundError, RuntimeError) as error:
+    except (ImportError, RuntimeError) as error:
         sys.stderr.write(f"{error}\n")
         return 1
     return 0

@@ -406,6 +406,15 @@ def test_hidden_from_the_start_is_zero(env: PositioningEnv, hide: Callable[..., 
     assert observation["object_position"].tolist() == [[0.0, 0.0]]
 
 
+def test_positions_hold_when_the_camera_moves(env: PositioningEnv, case: Case) -> None:
+    env.reset(seed=27, options={"goal_position": GOAL})
+    before = env.project(GOAL)
+    env.data.cam_xpos[env.camera.camera_id] += (0.04, 0.04, 0.0)
+    assert error(env._observe(env.data)) < case.error
+    assert np.linalg.norm(env.project(GOAL) - before) > 1
+    env.reset()
+
+
 # Virtual target.
 
 

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from torchrl_ocwm.envs.missing import needs
@@ -37,6 +36,7 @@ def _quiet() -> Iterator[None]:
 
 
 with needs("Cube move", "robosuite"), _quiet():
+    import mujoco
     from robosuite.controllers import load_composite_controller_config, load_part_controller_config
     from robosuite.environments.manipulation.lift import Lift
     from robosuite.models.objects import BoxObject

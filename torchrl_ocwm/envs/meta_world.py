@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from typing import Any, ClassVar
 
-import mujoco
 import numpy as np
 
 from torchrl_ocwm.envs.missing import needs
@@ -13,6 +12,7 @@ from torchrl_ocwm.envs.positioning import PositioningEnv
 from torchrl_ocwm.envs.workspace import Workspace
 
 with needs("Shelf place and Pick & place", "metaworld"):
+    import mujoco
     from metaworld.envs.sawyer_pick_place_v3 import SawyerPickPlaceEnvV3
     from metaworld.envs.sawyer_shelf_place_v3 import SawyerShelfPlaceEnvV3
     from metaworld.policies.sawyer_pick_place_v3_policy import SawyerPickPlaceV3Policy

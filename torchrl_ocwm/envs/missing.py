@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+_NOT_FOR_3_13 = ("dm_control", "robosuite")
+
+
+def missing(what: str, module: str, extra: str) -> ModuleNotFoundError:
+    """What to install where ``module`` is missing, on one line."""
+    remedy = f"pip install 'torchrl-ocwm[{extra}]'"
+    if module.split(".")[0] in _NOT_FOR_3_13 and sys.version_info >= (3, 13):
+        remedy = "there is none for Python 3.13 and newer; use 3.10, 3.11 or 3.12"
+    return ModuleNotFoundError(f"{what} needs {module}, which is not installed: {remedy}", name=module)
 
 
 @contextmanager
@@ -17,9 +28,7 @@ def needs(what: str, extra: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"{what} needs {error.name}, which is not installed: pip install 'torchrl-ocwm[{extra}]'", name=error.name
-        ) from None
+        raise missing(what, str(error.name), extra) from None
     except ImportError as error:
         raise ImportError(
             f"{what} needs a library of the system that is missing ({error}): for OpenCV, "

@@ -12,6 +12,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+from torchrl_ocwm.envs.missing import missing
+
 #: Everything that holds an OpenGL context and has a ``close`` method.
 OPEN: weakref.WeakSet[Any] = weakref.WeakSet()
 
@@ -24,9 +26,7 @@ def import_mujoco() -> Any:
         RuntimeError: if the OpenGL library is missing, with what to install.
     """
     if find_spec("mujoco") is None:
-        raise ModuleNotFoundError(
-            "rendering needs MuJoCo, which is not installed: pip install 'torchrl-ocwm[dm-control]'", name="mujoco"
-        )
+        raise missing("rendering", "mujoco", "dm-control")
     try:
         return import_module("mujoco")
     except Exception as error:  # PyOpenGL fails in many ways when its library is missing

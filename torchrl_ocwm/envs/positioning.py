@@ -7,7 +7,6 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import mujoco
 import numpy as np
 import torch
 
@@ -19,6 +18,7 @@ from torchrl_ocwm.envs.workspace import Workspace
 
 with needs("an environment", "dm-control"):
     import gymnasium
+    import mujoco
     from gymnasium import spaces
 
 TARGET_COLOUR = (230, 40, 40)

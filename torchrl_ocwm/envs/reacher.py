@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from importlib.resources import as_file, files
 
-import mujoco
 import numpy as np
 
 from torchrl_ocwm.envs.missing import needs
@@ -13,6 +12,7 @@ from torchrl_ocwm.envs.workspace import Workspace
 
 with needs("Reacher", "dm-control"):
     import dm_control
+    import mujoco
 
 # dm_control.suite would load a renderer of its own, which may fail where MuJoCo's works.
 _SUITE = files(dm_control) / "suite"

@@ -13,6 +13,7 @@ import torch
 from torchrl.envs import EnvBase, InitTracker, ParallelEnv, TransformedEnv
 
 from torchrl_ocwm.envs.goal_env import GoalEnv
+from torchrl_ocwm.envs.missing import missing
 from torchrl_ocwm.envs.options import CubeMoveOptions, EnvOptions, MetaWorldOptions
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.settings import Settings, SettingsError, from_dict
@@ -150,12 +151,9 @@ def _find(name: str) -> Environment:
     environment = ENVIRONMENTS.get(name) or by_id.get(name)
     if environment is None:
         raise ValueError(f"unknown environment {name!r}; there are {', '.join(ENVIRONMENTS)}")
-    for module, extra in (("gymnasium", environment.extra), (environment.module, environment.extra)):
+    for module in ("gymnasium", "mujoco", environment.module):
         if find_spec(module) is None:
-            raise ModuleNotFoundError(
-                f"environment {name!r} needs {module}, which is not installed: pip install 'torchrl-ocwm[{extra}]'",
-                name=module,
-            )
+            raise missing(f"environment {name!r}", module, environment.extra)
     return environment
 
 
