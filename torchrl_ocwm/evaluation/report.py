@@ -165,7 +165,7 @@ class Report:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """All numbers, ready for :func:`to_json`."""
+        """All numbers, ready for JSON."""
         agents: dict[str, Any] = {}
         for agent, row in self.rows.items():
             summaries = {name: self.summary(agent, name) for name in COLUMNS}
@@ -179,7 +179,7 @@ class Report:
                 },
                 "per_goal": row.seeds,
             }
-        return {"settings": self.settings, "goals": self.goals, "agents": agents}
+        return _plain({"settings": self.settings, "goals": self.goals, "agents": agents})
 
     def save(self, folder: str | Path) -> None:
         """Write ``results.json`` and ``results.md``, each in one step.
