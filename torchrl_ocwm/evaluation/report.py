@@ -220,12 +220,13 @@ def _tensors(seed: dict[str, list[float | None]]) -> dict[str, Tensor]:
 
 
 def _cell(pair: tuple[float, float | None] | None, digits: int) -> str:
-    """Mean ± error, with more digits where the error would be shown as zero."""
+    """Mean ± error; an error that would be shown as zero gets a digit more, and is rounded up."""
     if pair is None:
         return "–"
     mean, error = pair
     if error is None:
         return f"{mean:.{digits}f}"
     if 0 < error < 0.5 * 10**-digits:
-        digits = min(-math.floor(math.log10(error)), digits + 3)
+        digits += 1
+        error = math.ceil(error * 10**digits) / 10**digits
     return f"{mean:.{digits}f} ± {error:.{digits}f}"
