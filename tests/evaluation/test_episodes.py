@@ -1,7 +1,11 @@
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -10,8 +14,12 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from torchrl_ocwm.agents import build_agent
+from torchrl_ocwm.data import SmoothRandomPolicy
+from torchrl_ocwm.data.collect import collect
+from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import Task, make_task
 from torchrl_ocwm.evaluation import (
     EvaluationEnvs,
@@ -21,6 +29,7 @@ from torchrl_ocwm.evaluation import (
     goal_images,
     transition,
 )
+from torchrl_ocwm.processes import WorkerError
 from torchrl_ocwm.testing import random_records, reacher_task
 
 
@@ -43,6 +52,18 @@ def envs(task: Task) -> Iterator[EvaluationEnvs]:
         yield envs
 
 
+class Drawing(SmoothRandomPolicy):
+    """Acts by random numbers, and says how it explores."""
+
+    def __init__(self) -> None:
+        super().__init__(2)
+        self.seen: set[Any] = set()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.seen.add(exploration_type())
+        return super().forward(tensordict)
+
+
 def goals(task: Task, number: int) -> Tensor:
     return task.workspace.grid(4).flatten(0, 1)[:number]
 
@@ -60,6 +81,69 @@ def test_seed_decides(envs: EvaluationEnvs, task: Task) -> None:
     first, second, other = (envs.run(push, goals(task, 6), seed=seed) for seed in (3, 3, 4))
     torch.testing.assert_close(first["object_position_true"], second["object_position_true"], rtol=0, atol=0)
     assert not torch.equal(first["object_position_true"], other["object_position_true"])
+
+
+@pytest.mark.parametrize(("workers", "number"), [(0, 2), (2, 2)])
+def test_episodes_do_not_depend_on_the_layout(envs: EvaluationEnvs, task: Task, workers: int, number: int) -> None:
+    """Neither starts nor random actions, nor the states that a world model draws."""
+    agent = build_agent("focus_lcp", task, "debug")
+    torch.manual_seed(1)
+    expected = [envs.run(policy, goals(task, 5), seed=3) for policy in (Drawing(), agent.policy())]
+    with EvaluationEnvs(task, episode_steps=5, workers=workers, envs=number) as other:
+        drawn, acted = (other.run(policy, goals(task, 5), seed=3) for policy in (Drawing(), agent.policy()))
+    torch.testing.assert_close(drawn["object_position_true"], expected[0]["object_position_true"], rtol=0, atol=0)
+    torch.testing.assert_close(acted["object_position_true"], expected[1]["object_position_true"], rtol=0, atol=1e-6)
+
+
+def test_some_goals_again(envs: EvaluationEnvs, task: Task) -> None:
+    """A film of some goals shows the episodes that were scored."""
+    all_of_them = envs.run(Drawing(), goals(task, 6), seed=3)
+    chosen = torch.tensor([1, 4])
+    again = envs.run(Drawing(), goals(task, 6)[chosen], seed=3, numbers=chosen)
+    torch.testing.assert_close(again["object_position_true"], all_of_them["object_position_true"][chosen])
+
+
+def test_starts_are_not_those_of_collecting(task: Task, tmp_path: Path) -> None:
+    options = {"horizon": 5}
+    collected = collect(tmp_path / "d", "reacher", Collection(steps=30, workers=0), options=options, progress=False)
+    starts = collected.records["next", "proprio"][collected.records["is_init"].squeeze(-1)]
+    with EvaluationEnvs(task, episode_steps=1, workers=0, envs=6) as envs:
+        episodes = envs.run(push, goals(task, 6), inspect=transition)
+    here = episodes["transition", "proprio"][:, 0]
+    assert torch.cdist(here, starts).min() > 1e-3
+
+
+def test_evaluation_does_not_explore_whatever_the_context(envs: EvaluationEnvs, task: Task) -> None:
+    policy = Drawing()
+    with set_exploration_type(ExplorationType.RANDOM):
+        envs.run(policy, goals(task, 1))
+    assert policy.seen == {ExplorationType.DETERMINISTIC}
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_process_that_dies_or_hangs_ends_the_evaluation(task: Task, number: signal.Signals) -> None:
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        [child] = multiprocessing.active_children()
+        os.kill(child.pid, number)  # type: ignore[arg-type]
+        return push(tensordict)
+
+    message = "has ended .signal SIGKILL" if number == signal.SIGKILL else "no sign of life for 3 seconds"
+    with EvaluationEnvs(task, episode_steps=5, workers=1, envs=1, timeout=3) as envs:
+        envs.run(push, goals(task, 1))
+        with pytest.raises(WorkerError, match=message):
+            envs.run(act, goals(task, 1))
+    assert not multiprocessing.active_children()
+
+
+def test_evaluations_leave_no_descriptors(task: Task) -> None:
+    def evaluate(workers: int) -> int:
+        with EvaluationEnvs(task, episode_steps=2, workers=workers, envs=2) as envs:
+            envs.run(push, goals(task, 3))
+        goal_images(task, goals(task, 1))
+        return len(os.listdir("/proc/self/fd"))
+
+    first = evaluate(1), evaluate(0)  # what is opened once and for all
+    assert [evaluate(workers) for workers in (0, 0, 0, 1)] == [first[1]] * 4
 
 
 def test_episodes_move_with_the_policy(envs: EvaluationEnvs, task: Task) -> None:
@@ -106,9 +190,9 @@ def test_each_environment_keeps_its_goal_image(task: Task, workers: int) -> None
 
     with EvaluationEnvs(task, episode_steps=3, workers=workers, envs=2) as envs:
         envs.run(look, places, images=images)
-    full = images[[0, 1, 2, 2]].split(max(workers, 1) * 2)
+    chunks = images.split(max(workers, 1) * 2)
     for step, given in enumerate(seen):
-        torch.testing.assert_close(given.flatten(0, 1), full[step // 3], rtol=0, atol=0)
+        torch.testing.assert_close(given, chunks[step // 3], rtol=0, atol=0)
 
 
 def test_goal_images_show_the_object_at_the_goal(task: Task) -> None:
@@ -159,11 +243,13 @@ class Constant(torch.nn.Module):
 
 def test_landmarks(task: Task) -> None:
     agent = build_agent("dreamer_pcp", task, "debug")
-    scores = LandmarkEvaluation(agent, episodes=2, episode_steps=3)(0)
+    with LandmarkEvaluation(agent, episodes=2, episode_steps=3) as evaluation:
+        scores, again = evaluation(0), evaluation(1)
     assert set(scores) == {f"evaluation/{name}" for name in ("final_score", "mean_score", "success", "final_distance")}
+    assert scores == again  # each time the same episodes
     assert 0 < scores["evaluation/final_score"] < 1
     with pytest.raises(ValueError, match="11 evaluation episodes, but reacher has 10 landmarks"):
-        LandmarkEvaluation(agent, episodes=11, episode_steps=3)(0)
+        LandmarkEvaluation(agent, episodes=11, episode_steps=3)
 
 
 def test_the_test_task_is_reachers(task: Task) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,9 @@ import pytest
 import torch
 from torchrl.record.loggers import CSVLogger
 
+from torchrl_ocwm.evaluation import Report
 from torchrl_ocwm.evaluation.imagined import imagined_rollout
+from torchrl_ocwm.evaluation.output import OutputError
 from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, read_scalar
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm, decode_video, mark, open_loop_prediction, tile, write_video
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
@@ -107,3 +111,66 @@ def test_film_and_imagined_video(make_agent: Any, tmp_path: Path) -> None:
     start = agent.imagination.reset().expand(3).clone()["latent"]
     latents = imagined_rollout(agent, start, 4)["latent"]
     assert decode_video(agent.model, latents).shape == (3, 4, 3, 64, 64)
+
+
+def test_cut_lines_of_a_log_are_left_out(tmp_path: Path) -> None:
+    file = tmp_path / "log" / "scalars" / "score.csv"
+    file.parent.mkdir(parents=True)
+    file.write_text("10,0.5\n20,0.75\n3")
+    with pytest.warns(RuntimeWarning, match=r"score\.csv: 1 line\(s\) are not a step and a value"):
+        steps, values = read_scalar(tmp_path, "score")
+    assert (steps.tolist(), values.tolist()) == ([10, 20], [0.5, 0.75])
+    file.write_text("")
+    assert read_scalar(tmp_path, "score") is None
+
+
+@pytest.fixture
+def tiny_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system with room for 64 kB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(folder)], check=False)
+    if mounted.returncode:
+        pytest.skip("a full disk needs the right to mount one")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def write_noise(file: Path, frames: int) -> None:
+    write_video(file, torch.randint(0, 255, (frames, 3, 32, 32), dtype=torch.uint8))
+
+
+def draw_noise(file: Path, size: int) -> None:
+    heatmap(file, {str(index): torch.rand(9) for index in range(size)}, reacher_task().workspace)
+
+
+def save_noise(file: Path, size: int) -> None:
+    report = Report(torch.rand(size, 2))
+    report.add("agent", {"final_score": torch.rand(size)}, source="x")
+    report.save(file.parent)
+
+
+@pytest.mark.parametrize(
+    ("write", "name", "little", "much"),
+    [
+        (write_noise, "video.mp4", 2, 200),
+        (draw_noise, "map.png", 1, 20),
+        (save_noise, "results.json", 2, 2000),
+    ],
+)
+def test_full_disk_leaves_the_file_of_before(
+    tiny_disk: Path, write: Callable[[Path, int], None], name: str, little: int, much: int
+) -> None:
+    file = tiny_disk / name
+    write(file, little)
+    before, there = file.read_bytes(), sorted(tiny_disk.iterdir())
+    with pytest.raises(OutputError, match=rf"{name}: cannot be written \(.*(No space left|disk full)"):
+        write(file, much)
+    assert file.read_bytes() == before
+    assert sorted(tiny_disk.iterdir()) == there
+
+
+def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match=r"map\.png: cannot be written \(File exists\)"):
+        draw_noise(tmp_path / "file" / "map.png", 1)

@@ -42,6 +42,22 @@ def test_measure_by_hand() -> None:
     torch.testing.assert_close(scores["mean_score"], torch.tensor([first, math.exp(-0.6)]))
 
 
+def test_goals_at_the_start_have_no_score() -> None:
+    """The mean leaves them out, whatever the policy did there; distances are still distances."""
+    goals = torch.tensor([[0.0, 0.0], [0.1, 0.0], [0.0, 0.2]])
+    reached = (goals + torch.tensor([0.01, 0.0]))[:, None, None].expand(-1, 3, 1, -1)
+    scores = measure(
+        TensorDict({"object_position_true": reached, "goal_position": goals[:, None].expand(-1, 3, -1)}, [3, 3])
+    )
+    assert scores["final_score"].isnan().tolist() == [True, False, False]
+    report = Report(goals)
+    report.add("agent", scores, source="x")
+    expected = (math.exp(-0.1) + math.exp(-0.05)) / 2
+    assert report.summary("agent", "final_score") == (pytest.approx(expected), None)
+    assert report.summary("agent", "final_distance") == (pytest.approx(0.01), None)
+    assert report.markdown().splitlines()[-1] == "Without a score, as they lie at the start: 1 of 3 goals."
+
+
 class TestReport:
     @pytest.fixture
     def report(self) -> Report:
@@ -57,7 +73,7 @@ class TestReport:
             "| agent | seeds | final score | goal reconstruction error, m |",
             "|---|---|---|---|",
             "| random | 1 | 0.30 | – |",
-            "| dreamer | 2 | 0.75 ± 0.10 | 0.020 ± 0.000 |",
+            "| dreamer | 2 | 0.75 ± 0.10 | 0.020 ± 0.000 |",  # the same to the last digit
         ]
 
     def test_files(self, report: Report, tmp_path: Path) -> None:
@@ -92,3 +108,51 @@ class TestReport:
 
     def test_heatmap_is_the_mean_over_seeds(self, report: Report) -> None:
         torch.testing.assert_close(report.per_goal("final_score")["dreamer"], torch.tensor([0.7, 0.8]))
+
+    def test_small_errors_are_shown(self) -> None:
+        report = Report(torch.tensor([[0.1, 0.0]]))
+        for seed, score in enumerate((0.902, 0.908)):
+            report.add("dreamer", {"final_score": torch.tensor([score])}, source=str(seed))
+        assert report.markdown().splitlines()[-1] == "| dreamer | 2 | 0.905 ± 0.003 |"
+
+    def test_a_run_counts_once(self, report: Report, tmp_path: Path) -> None:
+        scores = {"final_score": torch.zeros(2)}
+        report.add("new", scores, source="a/checkpoint.zip", run="its contents")
+        message = r"b/checkpoint\.zip: the same run as a/checkpoint\.zip, which counts as a seed of new already"
+        with pytest.raises(ValueError, match=message):
+            report.add("new", scores, source="b/checkpoint.zip", run="its contents")
+        report.save(tmp_path)
+        with pytest.raises(ValueError, match="counts as a seed of random already"):
+            report.include(Report.load(tmp_path / "results.json"))  # itself
+
+    def test_agents_of_another_kind_are_another_row(self, report: Report, tmp_path: Path) -> None:
+        for seed, kind in enumerate(("small", "large", "small")):
+            report.add("new", {"final_score": torch.full((2,), seed / 10)}, source=str(seed), kind=kind)
+        assert report.markdown().splitlines()[-2:] == ["| new | 2 | 0.10 ± 0.10 | – |", "| new #2 | 1 | 0.10 | – |"]
+        report.save(tmp_path)
+        again = Report.load(tmp_path / "results.json")
+        again.add("new", {"final_score": torch.tensor([0.3, 0.3])}, source="3", kind="large")
+        assert [len(row.seeds) for row in again.rows.values()] == [1, 2, 2, 2]
+
+    def test_json_is_strict(self, report: Report, tmp_path: Path) -> None:
+        report.add(
+            "odd", {"final_score": torch.tensor([math.nan, 0.5]), "goal_error": torch.full((2,), math.inf)}, source="x"
+        )
+        report.save(tmp_path)
+
+        def refuse(name: str) -> None:
+            raise AssertionError(name)
+
+        numbers = json.loads((tmp_path / "results.json").read_text(), parse_constant=refuse)
+        assert numbers["agents"]["odd"]["per_goal"] == [{"final_score": [None, 0.5], "goal_error": [None, None]}]
+        assert Report.load(tmp_path / "results.json").summary("odd", "final_score") == (0.5, None)
+
+    def test_older_files(self, tmp_path: Path) -> None:
+        """Without what a run is known by: their sources stand for it."""
+        row = {"sources": ["a", "b"], "per_goal": [{"final_score": [0.5]}, {"final_score": [0.7]}], "metrics": {}}
+        (tmp_path / "results.json").write_text(
+            json.dumps({"settings": {}, "goals": [[0.1, 0.1]], "agents": {"dreamer": row}})
+        )
+        report = Report.load(tmp_path / "results.json")
+        assert report.rows["dreamer"].runs == ["a", "b"]
+        assert report.summary("dreamer", "final_score") == (pytest.approx(0.6), pytest.approx(0.1))

@@ -52,18 +52,16 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     files.append(train(dataset, tmp_path / "lcp", "agent=focus_lcp"))
     assert (tmp_path / "pcp" / "videos" / "open_loop_0000004.mp4").stat().st_size > 1000
     assert list((tmp_path / "pcp" / "tensorboard").iterdir())
-    kept = OmegaConf.load(tmp_path / "pcp" / ".hydra" / "config.yaml")
+    kept = OmegaConf.load(tmp_path / "pcp" / "config.yaml")
     assert kept.env.options.horizon == 30  # the dataset's, where the command has the default
-    assert (kept.training.updates, kept.agent.reward) == (4, "position_distance")
-    checkpoints = ",".join(map(str, files))
+    assert (kept.training.updates, kept.agent.behaviours.reach.reward.name) == (4, "position_distance")
+    pcp, dreamer, second, lcp = files
     output = tmp_path / "evaluation"
+    small = ("goals=4", "episode_steps=3", "workers=0", "envs=4")
     printed = run(
         "evaluate.py",
-        f"checkpoint=[{checkpoints}]",
-        "goals=4",
-        "episode_steps=3",
-        "workers=0",
-        "envs=4",
+        f"checkpoint=[{pcp},{dreamer},{lcp}]",
+        *small,
         "video_goals=2",
         "image_goals=true",
         f"output={output}",
@@ -71,26 +69,24 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     table = (output / "results.md").read_text()
     assert table in printed
     rows = [line.split(" | ") for line in table.splitlines()[2:]]
-    assert [row[0] for row in rows] == [
-        "| random",
-        "| dreamer_pcp",
-        "| dreamer",
-        "| focus_lcp",
-        "| focus_lcp, image goals",
-    ]
-    assert [row[1] for row in rows] == ["1", "1", "2", "1", "1"]
+    names = ["random", "dreamer_pcp", "dreamer", "focus_lcp", "focus_lcp, image goals"]
+    assert [row[0] for row in rows] == [f"| {name}" for name in names]
+    assert [row[1] for row in rows] == ["1"] * 5
     assert rows[1][-1].startswith("–")  # PCP's world model does not know the goal
-    assert "±" in rows[2][-1]
     results = json.loads((output / "results.json").read_text())
     assert len(results["agents"]["dreamer"]["per_goal"][0]["final_score"]) == 4
     for name in ("heatmap.png", "learning_curve.png", "episodes.mp4", "episodes_image_goals.mp4"):
         assert (output / name).stat().st_size > 1000, name
-    again = ("goals=4", "episode_steps=3", "workers=0", "envs=4", "video_goals=0", "random=false")
-    printed = run(
-        "evaluate.py", f"checkpoint={files[0]}", f"include=[{output}/results.json]", *again, f"output={tmp_path}/more"
-    )
-    assert [line.split(" | ")[1] for line in printed.splitlines()[2:7]] == ["1", "2", "2", "1", "1"]
-    assert torchrl_ocwm.load_agent(files[0]).agent.config.behaviours["reach"].goal == Position()
+    more = (f"include=[{output}/results.json]", *small, "video_goals=0", f"output={tmp_path}/more")
+    printed = run("evaluate.py", f"checkpoint={second}", *more)  # random actions are in it already
+    rows = [line.split(" | ") for line in printed.splitlines()[2:7]]
+    assert [row[1] for row in rows] == ["1", "1", "2", "1", "1"]
+    assert "±" in rows[2][-1]
+    for again in (f"checkpoint={pcp}", f"checkpoint=[{second},{second}]"):
+        error = run("evaluate.py", again, *more, fails=True)
+        assert "which counts already; leave one of them out" in error
+        assert "Traceback" not in error
+    assert torchrl_ocwm.load_agent(pcp).agent.config.behaviours["reach"].goal == Position()
 
 
 @pytest.mark.parametrize(
@@ -98,7 +94,7 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     [
         ("train_offline.py", ("agent=muzero",), "dreamer_pcp"),
         ("train_offline.py", ("dataset=/nowhere",), "DatasetError: /nowhere/dataset.json: no such file"),
-        ("collect.py", ("steps=0",), "ValueError: steps and workers must be at least 1"),
+        ("collect.py", ("steps=0",), "ValueError: steps must be at least 1, got 0"),
         ("evaluate.py", ("checkpoint=/nowhere.zip",), "CheckpointError: /nowhere.zip: no such checkpoint"),
     ],
 )

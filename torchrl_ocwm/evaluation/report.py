@@ -165,7 +165,7 @@ class Report:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """All numbers, ready for :func:`to_json`."""
+        """All numbers, ready for JSON."""
         agents: dict[str, Any] = {}
         for agent, row in self.rows.items():
             summaries = {name: self.summary(agent, name) for name in COLUMNS}
@@ -179,7 +179,7 @@ class Report:
                 },
                 "per_goal": row.seeds,
             }
-        return {"settings": self.settings, "goals": self.goals, "agents": agents}
+        return _plain({"settings": self.settings, "goals": self.goals, "agents": agents})
 
     def save(self, folder: str | Path) -> None:
         """Write ``results.json`` and ``results.md``, each in one step.
@@ -220,12 +220,13 @@ def _tensors(seed: dict[str, list[float | None]]) -> dict[str, Tensor]:
 
 
 def _cell(pair: tuple[float, float | None] | None, digits: int) -> str:
-    """Mean ± error, with more digits where the error would be shown as zero."""
+    """Mean ± error; an error that would be shown as zero gets a digit more, and is rounded up."""
     if pair is None:
         return "–"
     mean, error = pair
     if error is None:
         return f"{mean:.{digits}f}"
     if 0 < error < 0.5 * 10**-digits:
-        digits = min(-math.floor(math.log10(error)), digits + 3)
+        digits += 1
+        error = math.ceil(error * 10**digits) / 10**digits
     return f"{mean:.{digits}f} ± {error:.{digits}f}"

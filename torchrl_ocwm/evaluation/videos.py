@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -54,18 +55,19 @@ def write_video(path: str | Path, frames: Tensor, *, fps: int = 15, scale: int =
     images = np.pad(images, [(0, 0), (0, images.shape[1] % 2), (0, images.shape[2] % 2), (0, 0)])
     options: dict[str, Any] = {"codec": "libx264", "macro_block_size": 1, "ffmpeg_log_level": "quiet"}
     with writing(path) as file:
-        imageio.imwrite(file, images, plugin="FFMPEG", fps=fps, **options)
-        _check_whole(file, len(images))
+        with suppress(OSError):  # FFmpeg has ended: with or without an error, see below
+            imageio.imwrite(file, images, plugin="FFMPEG", fps=fps, **options)
+        written = _frames(file)
+        if written != len(images):
+            raise OSError(f"ffmpeg wrote {written} of {len(images)} frames; is the disk full, or the folder not yours?")
 
 
-def _check_whole(file: Path, frames: int) -> None:
-    """FFmpeg ends without an error that can be caught when the disk is full."""
+def _frames(file: Path) -> int:
+    """How many frames a video has; none, if it is broken."""
     try:
-        written, _ = imageio_ffmpeg.count_frames_and_secs(file)
+        return imageio_ffmpeg.count_frames_and_secs(file)[0]
     except RuntimeError:
-        written = 0
-    if written != frames:
-        raise OSError(f"ffmpeg wrote {written} of {frames} frames; is the disk full?")
+        return 0
 
 
 def tile(rows: list[Tensor], gap: int = 2) -> Tensor:
