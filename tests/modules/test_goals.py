@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,7 +11,8 @@ from torch import nn
 from torchrl_ocwm.agents import SIZES, Agent, build_agent
 from torchrl_ocwm.modules import FrameGoals, GivenGoals, MixedGoals, UnitRMS, WorkspaceUnits
 from torchrl_ocwm.modules.rewards import LatentSimilarity
-from torchrl_ocwm.testing import random_records, reacher_task
+from torchrl_ocwm.settings import change
+from torchrl_ocwm.testing import STYLES, random_records, reacher_task
 
 UNITS = WorkspaceUnits((-0.2, -0.2), (0.2, 0.2))
 

@@ -75,7 +75,7 @@ def test_a_signal_ends_it_with_a_checkpoint_and_without_children(
 def test_the_configuration_of_a_run_that_is_refused_is_not_kept(dataset: EpisodeDataset, tmp_path: Path) -> None:
     run = command(dataset, f"output={tmp_path}", *QUICK)
     subprocess.run(run, check=True, capture_output=True)
-    kept = tmp_path / ".hydra" / "config.yaml"
+    kept = tmp_path / "config.yaml"
     before = kept.read_text()
     assert OmegaConf.load(kept).training.updates == 2
     done = subprocess.run([*run, "training.final_lr=0.7"], check=False, capture_output=True, text=True)
@@ -91,7 +91,7 @@ def test_each_job_of_a_multirun_has_a_folder_of_its_own(dataset: EpisodeDataset,
     subprocess.run(command(dataset, *folder, *sweep), check=True, capture_output=True)
     found = sorted(tmp_path.glob("*/*/checkpoint.zip"))
     assert len(found) == 4
-    rates = [OmegaConf.load(file.parent / ".hydra" / "config.yaml").training.final_lr for file in found]
+    rates = [OmegaConf.load(file.parent / "config.yaml").training.final_lr for file in found]
     assert sorted(rates) == [0.1, 0.1, 0.7, 0.7]
     for file, rate in zip(found, rates, strict=True):
         assert f"training.final_lr={rate}" in file.parent.name

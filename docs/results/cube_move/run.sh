@@ -39,7 +39,7 @@ done
 train dreamer $((updates + rounds * updates / 2)) 0.1
 
 for agent in dreamer focus_pcp focus_lcp; do
-  cp "$(run $agent)/.hydra/config.yaml" $here/${agent}_seed_0.yaml
+  cp "$(run $agent)/config.yaml" $here/${agent}_seed_0.yaml
   cp "$(run $agent)/log/scalars/evaluation/final_score.csv" $here/${agent}_seed_0.csv
   cp "$(run $agent)/log/scalars/return_high.csv" $here/${agent}_seed_0_imagined_return.csv
 done

@@ -22,9 +22,9 @@ for agent in $agents; do
   for seed in 0 1; do
     run=$runs/$agent/cpu/seed_$seed name=${agent}_seed_$seed
     checkpoints+=("$run/checkpoint.zip")
-    cp "$run/.hydra/config.yaml" "$here/$name.yaml"
+    cp "$run/config.yaml" "$here/$name.yaml"
     cp "$run/log/scalars/evaluation/final_score.csv" "$here/$name.csv"
-    echo "$name $(($(stat -c %Y "$run/checkpoint.zip") - $(stat -c %Y "$run/.hydra/config.yaml"))) s" >> "$here/wall_time.txt"
+    echo "$name $(($(stat -c %Y "$run/checkpoint.zip") - $(stat -c %Y "$run/config.yaml"))) s" >> "$here/wall_time.txt"
   done
 done
 python examples/evaluate.py goals=100 image_goals=true output=$here "checkpoint=[$(IFS=,; echo "${checkpoints[*]}")]"
