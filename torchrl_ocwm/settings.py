@@ -46,10 +46,10 @@ class Settings:
     """Base of frozen dataclasses whose values are checked against their types and ranges when they are made.
 
     A subclass is a ``@dataclass(frozen=True)``; its docstring says what each field is, under ``Args:``. What the types
-    cannot say, it checks in :meth:`check`.
+    cannot say, it checks in :meth:`validate`.
 
     Raises:
-        SettingsError: for a value of another type, outside its range, or that :meth:`check` refuses.
+        SettingsError: for a value of another type, outside its range, or that :meth:`validate` refuses.
 
     Examples:
         >>> from dataclasses import dataclass
@@ -68,9 +68,9 @@ class Settings:
             value = read(_hints(type(self))[one.name], getattr(self, one.name), one.name)
             _check_range(one, value)
             object.__setattr__(self, one.name, value)
-        self.check()
+        self.validate()
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Check what types and ranges cannot say; raises :class:`SettingsError`."""
 
     @classmethod

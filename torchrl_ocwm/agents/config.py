@@ -46,7 +46,7 @@ class AgentConfig(Settings):
     world_model: WorldModelPart = field(default_factory=Flat)
     behaviours: Mapping[str, Behaviour] = field(default_factory=lambda: {REACH: Behaviour()})
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """There is something to learn, and names fit into those of losses."""
         if not self.behaviours:
             raise SettingsError("behaviours must have at least one")

@@ -53,7 +53,7 @@ class _Observing(WorldModelPart):
     lambda_object_position: float = setting(200.0, at_least=0)
     lambda_goal_position: float = setting(1.0, at_least=0)
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """A weight of what is not observed does nothing."""
         for one in fields(self):
             name = one.name.removeprefix("lambda_")

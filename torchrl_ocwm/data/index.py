@@ -267,12 +267,10 @@ def _check_source(index: dict[str, Any]) -> None:
     try:
         task = Task.from_dict(index["task"])
     except ValueError as error:
-        raise DatasetError(f"task: {error}") from error
+        raise DatasetError(str(error)) from error
     if index["environment"] != task.name:
         raise DatasetError(f"the environment {index['environment']!r} is not that of the task, {task.name!r}")
     options = {name: value for name, value in index["options"].items() if name != "horizon"}
     if options != task.options or options.get("image_size", task.image_size) != task.image_size:
         raise DatasetError(f"the options {index['options']} are not those of the task, {task.options}")
-    if any(len(landmark) != task.workspace.dim for landmark in task.workspace.landmarks):
-        raise DatasetError(f"task.workspace.landmarks: expected {task.workspace.dim} coordinates each")
     check_keys(index["keys"], task)

@@ -39,7 +39,7 @@ class CubeMoveOptions(EnvOptions):
     mask_scale: int = setting(3, at_least=1, at_most=64)
     objects: tuple[Literal["cube", "distractor"], ...] = ("cube",)
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """The cube alone or both."""
         if self.objects not in (("cube",), ("cube", "distractor")):
             raise SettingsError(f"objects must be [cube] or [cube, distractor], got {list(self.objects)}")

@@ -72,7 +72,7 @@ class EnvChoice(Settings):
     name: str
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Options are those of the environment."""
         if self.name not in ENVIRONMENTS:
             raise SettingsError(f"name must be one of {', '.join(ENVIRONMENTS)}, got {self.name!r}")

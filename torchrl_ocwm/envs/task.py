@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from torchrl_ocwm.envs.workspace import Workspace
+from torchrl_ocwm.settings import Settings, SettingsError, from_dict, to_dict
 
 #: Metres within which an entity counts as at its goal (paper, figure "reconstructions").
 SUCCESS_DISTANCE = 0.05
 
 
 @dataclass(frozen=True)
-class Task:
+class Task(Settings):
     """Shapes and workspace of a task. Datasets and checkpoints carry it.
 
     Args:
@@ -36,17 +38,25 @@ class Task:
     proprio: int
     action: int
     workspace: Workspace
-    options: dict[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def validate(self) -> None:
+        """There is something to position, and objects have names of their own."""
+        for name, least in (("image_size", 1), ("proprio", 0), ("action", 1)):
+            if getattr(self, name) < least:
+                raise SettingsError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if not self.objects or len(set(self.objects)) != len(self.objects):
+            raise SettingsError(f"objects must be one name or several different ones, got {self.objects}")
 
     def to_dict(self) -> dict[str, Any]:
         """A mapping that fits in JSON."""
-        return asdict(self)
+        return to_dict(self)
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Task:
-        """Read what :meth:`to_dict` wrote, also after a trip through JSON."""
-        workspace: dict[str, Any] = {
-            name: value if value is None else tuple(tuple(v) if isinstance(v, list) else v for v in value)
-            for name, value in values["workspace"].items()
-        }
-        return cls(**{**values, "objects": tuple(values["objects"]), "workspace": Workspace(**workspace)})
+    def from_dict(cls, values: Any) -> Task:
+        """Read what :meth:`to_dict` wrote, also after a trip through JSON.
+
+        Raises:
+            SettingsError: for what no task can be, with its name.
+        """
+        return from_dict(cls, values, "task")

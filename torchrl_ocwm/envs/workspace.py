@@ -8,9 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_ocwm.settings import Settings, SettingsError
+
 
 @dataclass(frozen=True)
-class Workspace:
+class Workspace(Settings):
     """The box of goal positions of a task, in metres from the start position.
 
     Goals are drawn uniformly in the box. What the robot can reach inside it may be smaller: for a planar arm it is
@@ -23,7 +25,7 @@ class Workspace:
         landmarks: Hand-picked goals for quick evaluations, metres (the paper draws its training curves with ten).
 
     Raises:
-        ValueError: if ``low`` is not below ``high`` on every axis.
+        SettingsError: if ``low`` is not below ``high`` on every axis, or the points do not fit them.
 
     Examples:
         >>> workspace = Workspace(low=(-0.24, -0.24), high=(0.24, 0.24), reach=(0.04, 0.24))
@@ -38,9 +40,14 @@ class Workspace:
     reach: tuple[float, float] | None = None
     landmarks: tuple[tuple[float, ...], ...] = ()
 
-    def __post_init__(self) -> None:
-        if len(self.low) != len(self.high) or not all(a < b for a, b in zip(self.low, self.high, strict=True)):
-            raise ValueError(f"a workspace needs low < high on every axis, got low={self.low} and high={self.high}")
+    def validate(self) -> None:
+        """Lower corners are lower, and all points have as many coordinates."""
+        if not 0 < len(self.low) == len(self.high) or not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise SettingsError(f"low must be below high on every axis, got {self.low} and {self.high}")
+        if self.reach is not None and not 0 <= self.reach[0] < self.reach[1]:
+            raise SettingsError(f"reach must be a smaller and a larger distance, got {self.reach}")
+        if odd := [point for point in self.landmarks if len(point) != len(self.low)]:
+            raise SettingsError(f"landmarks must have {len(self.low)} coordinates, got {odd[0]}")
 
     @property
     def dim(self) -> int:

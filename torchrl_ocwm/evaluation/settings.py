@@ -42,7 +42,7 @@ class Evaluation(Settings):
     seed: int = setting(0, at_least=0, at_most=2**32 - 1)
     timeout: float = setting(120.0, above=0)
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """A square grid."""
         if self.grid_size**2 != self.goals:
             near = [size**2 for size in (self.grid_size, self.grid_size + 1)]
@@ -84,7 +84,7 @@ class Diagnosis(Settings):
     seed: int = setting(0, at_least=0, at_most=2**32 - 1)
     device: str = "cpu"
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Some frames are seen and some imagined."""
         if self.context >= self.length:
             raise SettingsError(

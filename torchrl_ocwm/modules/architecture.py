@@ -55,7 +55,7 @@ class Architecture(Settings):
         """Arguments of :func:`~torchrl_ocwm.modules.networks.make_mlp` for networks of vectors."""
         return {"style": self.style, "layers": self.mlp_layers, "units": self.mlp_units}
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Numbers that do not fit together, and those that a style does not use."""
         if not self.cnn_mults:
             raise SettingsError("cnn_mults must have a multiplier for at least one stage, got ()")

@@ -63,7 +63,7 @@ class Training(Settings):
     loggers: tuple[Literal["tensorboard", "wandb"], ...] = ()
     changed: tuple[str, ...] = ()
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Only what may change can be said to."""
         for name in self.changed:
             if name not in self.changeable():
