@@ -222,6 +222,39 @@ def test_weights_and_keys(make_agent: Any, records: TensorDict) -> None:
 
 
 @pytest.mark.parametrize(
+    ("weight", "scaled"),
+    [
+        ("image_latent", {"image_latent", "image_position"}),
+        ("object_position", {"object_position", "image_position"}),
+    ],
+)
+def test_weights_of_images_alone(make_agent: Any, records: TensorDict, weight: str, scaled: set[str]) -> None:
+    world_model = make_agent("focus_lcp").model.records()
+    losses = []
+    for value in (1.0, 3.0):
+        torch.manual_seed(1)
+        losses.append(FOCUSModelLoss(world_model, **{f"lambda_{weight}": value})(records)[0])
+    for name, before in losses[0].items():
+        factor = 3 if name.removeprefix("loss_model_") in scaled else 1
+        torch.testing.assert_close(losses[1][name], factor * before)
+
+
+@pytest.mark.parametrize("distance", ["cosine", "mse"])
+def test_the_distance_reaches_what_encodes_goals(make_agent: Any, records: TensorDict, distance: Any) -> None:
+    loss = FOCUSModelLoss(make_agent("focus_lcp").model.records(), positional_distance=distance)
+    records["next", "object_visible"][0, 1] = False
+    losses, after = loss(records)
+    after = after["next"]
+    latent, visible = after["object_latent"][..., :-1, :], after["object_visible"]
+    for name, goal in (
+        ("positional", after["positional_latent"]),
+        ("image_latent", after["image_latent"][..., :-1, :]),
+    ):
+        expected = positional_latent_loss(goal, latent, visible, distance=distance)
+        torch.testing.assert_close(losses[f"loss_model_{name}"], expected)
+
+
+@pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"lambda_pixels": 0.0}, "lambda_pixels does nothing: FOCUSModelLoss has the terms .*object_pixels"),
