@@ -7,9 +7,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_ocwm import build_agent
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.data.contract import OPTIONAL, record_keys
 from torchrl_ocwm.testing import random_records, reacher_task
+from torchrl_ocwm.training import offline
+from torchrl_ocwm.training.offline import train_offline
+from torchrl_ocwm.training.settings import Training
 
 TASK = reacher_task(16)
 
@@ -196,3 +200,13 @@ def test_without_a_task_there_is_no_contract(tmp_path):
     assert dataset.records["action"].abs().max() > 1
     with pytest.raises(DatasetError, match=r"dataset\.json: holds no task"):
         dataset.task  # noqa: B018
+
+
+def test_an_agent_that_needs_what_is_missing(tmp_path):
+    """Named before anything is trained or written; an agent that does not need it is none the worse."""
+    dataset = stored(tmp_path / "data", episode().exclude(("next", "masks")))
+    agent = build_agent("focus_pcp", TASK, "debug")
+    with pytest.raises(DatasetError, match=r"holds no \[\('next', 'masks'\)\], which this agent learns from"):
+        train_offline(agent, dataset, tmp_path / "run", Training(updates=50))
+    assert not (tmp_path / "run").exists()
+    offline._check_task(build_agent("dreamer_pcp", TASK, "debug"), dataset)

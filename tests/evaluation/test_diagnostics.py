@@ -11,6 +11,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_ocwm.agents import build_agent
+from torchrl_ocwm.data import EpisodeDataset
 from torchrl_ocwm.evaluation import object_pictures, videos
 from torchrl_ocwm.evaluation.goal_latents import cosines, latent_pairs, match, ranks
 from torchrl_ocwm.evaluation.object_pictures import draw_errors, draw_goal_latents, draw_objects, object_rows
@@ -51,8 +53,20 @@ class TestSequences:
     def test_fit_or_are_refused(self, tmp_path: Path) -> None:
         dataset = random_dataset(tmp_path, reacher_task(), length=20)
         assert random_sequences(dataset, 9, 20).shape == (9, 20)
-        with pytest.raises(ValueError, match="sequences of 21 records do not fit in an episode of 20"):
+        with pytest.raises(ValueError, match="cannot cut sequences of 21 frames, the longest episode has 20"):
             random_sequences(dataset, 2, 21)
+
+    def test_short_episodes_are_skipped(self, tmp_path: Path) -> None:
+        random_dataset(tmp_path, reacher_task(), episodes=3, length=20)
+        with EpisodeDataset.open(tmp_path, write=True) as dataset:
+            short = random_records(reacher_task(), 1, 4, seed=9)[0]
+            short["next", "done"][-1] = True
+            dataset.append(short)
+        with pytest.warns(UserWarning, match="1 of 4 episodes are shorter than 10 frames and are skipped"):
+            records = random_sequences(dataset, 9, 10)
+        assert not torch.isin(records["next", "reward"], short["next", "reward"]).any()
+        agent = build_agent("dreamer_pcp", reacher_task(), "debug")
+        assert OpenLoopFilm(agent, dataset, tmp_path, length=10).records.shape == (6, 10)
 
 
 class TestMasks:

@@ -75,7 +75,7 @@ def test_errors_are_one_message(dataset: EpisodeDataset, tmp_path: Path) -> None
     file = checkpoint("focus_lcp", tmp_path)
     messages = {
         (f"dataset={other.path}",): f"ValueError: {other.path}: holds Task(name='reacher', image_size=32",
-        (f"dataset={short.path}",): f"{short.path}: sequences of 9 records do not fit in an episode of 8",
+        (f"dataset={short.path}",): f"{short.path}: cannot cut sequences of 9 frames, the longest episode has 8",
         (f"dataset={dataset.path}", "context=9"): "ValueError: context=9 of length=9 frames",
     }
     for arguments, message in messages.items():
