@@ -209,16 +209,10 @@ def test_index_says_how_much_there_is_to_see(tmp_path):
     task = make_task("reacher", **OPTIONS)
     position = dataset.records["next", "object_position_true"][:, 0]
     assert first == {"finger": object_coverage(position, dataset.episode_lengths, task.workspace)._asdict()}
-<<<<<<< HEAD
-    dataset.annotate(coverage=None)
-    assert gather(tmp_path / "data", 40).metadata["coverage"] == first
-    more = gather(tmp_path / "data", 200).metadata["coverage"]
-=======
     with EpisodeDataset.open(dataset.path, write=True) as dataset:
         dataset.annotate(coverage=None)
-    assert collect(tmp_path / "data", "reacher", 40, options=OPTIONS, progress=False).metadata["coverage"] == first
-    more = collect(tmp_path / "data", "reacher", 200, options=OPTIONS, progress=False).metadata["coverage"]
->>>>>>> data
+    assert gather(tmp_path / "data", 40).metadata["coverage"] == first
+    more = gather(tmp_path / "data", 200).metadata["coverage"]
     assert more["finger"]["visited"] > first["finger"]["visited"]
 
 

@@ -462,13 +462,8 @@ class TestBadInput:
             train(fresh(), other, tmp_path / "run")
 
     def test_sequences_longer_than_episodes(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
-<<<<<<< HEAD
         agent = build_agent("dreamer_pcp", reacher_task(), change(SIZES["debug"], {"learning.slice_len": 21}))
-        with pytest.raises(DatasetError, match="cannot cut sequences of 21 frames, the shortest episode has 20"):
-=======
-        agent = build_agent("dreamer_pcp", reacher_task(), replace(SIZES["debug"], slice_len=21))
         with pytest.raises(DatasetError, match="cannot cut sequences of 21 frames, the longest episode has 20"):
->>>>>>> data
             train(agent, dataset, tmp_path)
 
     def test_folder_that_cannot_be_written(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
