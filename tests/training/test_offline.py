@@ -31,6 +31,7 @@ from torchrl_ocwm.training.loggers import LogError
 from torchrl_ocwm.training.offline import EvaluationError, train_offline
 from torchrl_ocwm.training.settings import Training
 
+ZIP = "checkpoint.zip"
 SHORT = Training(updates=12, log_interval=2, checkpoint_interval=4, eval_interval=2)
 
 
@@ -114,6 +115,19 @@ class TestResume:
         train(watched, dataset, tmp_path / "watched", evaluate=lambda updates: {"noise": float(torch.rand(1))})
         train(alone, dataset, tmp_path / "alone")
         assert same(watched, alone)
+
+    def test_goals_change_the_run(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        first, second = fresh("dreamer"), fresh("dreamer")
+        train(first, dataset, tmp_path / "first", replace(SHORT, updates=2, goals="uniform"))
+        train(second, dataset, tmp_path / "second", replace(SHORT, updates=2, goals="stored"))
+        assert not same(first, second)
+
+    def test_threads(self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        threads: list[int] = []
+        monkeypatch.setattr(torch, "set_num_threads", threads.append)
+        for number in (0, 3):
+            train(fresh(), dataset, tmp_path / str(number), replace(SHORT, updates=2, threads=number))
+        assert threads == [3]
 
     def test_seed_changes_the_run(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         first, second = fresh(), fresh()
@@ -206,6 +220,14 @@ class TestGoingOn:
         ):
             train(fresh(), dataset, tmp_path)
 
+    def test_a_backup_of_an_earlier_release_is_gone_on_from(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        file = train(fresh(), dataset, tmp_path, replace(SHORT, updates=2))
+        file.rename(tmp_path / ".checkpoint.zip.backup-1")
+        started: list[int] = []
+        train(fresh(), dataset, tmp_path, replace(SHORT, updates=2), on_start=lambda: started.append(1))
+        assert not started
+        assert updates_in(file) == 2
+
     def test_starts_once(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         started: list[int] = []
         for updates in (2, 2, 4):
@@ -256,6 +278,18 @@ class TestLooking:
 
         train(fresh(), dataset, tmp_path, evaluate=evaluate)
         assert seen == {2: 0, 4: 4, 6: 4, 8: 8, 10: 8, 12: 12}
+
+    def test_the_last_update_is_saved_once_and_before_its_evaluation(
+        self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        saved, seen, save = [], [], Archive.save
+        monkeypatch.setattr(Archive, "save", lambda self, path: (saved.append(1), save(self, path)))
+        training = replace(SHORT, updates=2, checkpoint_interval=100)
+        train(
+            fresh(), dataset, tmp_path, training, evaluate=lambda updates: seen.append(updates_in(tmp_path / ZIP)) or {}
+        )
+        assert seen == [2]
+        assert len(saved) == 1
 
     def test_a_film_that_fails_is_a_warning(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         def fails(updates: int) -> Path:
@@ -506,8 +540,9 @@ class TestBadInput:
                 train(fresh(), dataset, tmp_path)
         assert file.read_bytes() == before
 
+    @pytest.mark.parametrize("log_interval", [2, 12], ids=["at a line of the log", "at a checkpoint"])
     def test_losses_that_are_not_finite(
-        self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log_interval: int
     ) -> None:
         file = train(fresh(), dataset, tmp_path, evaluate=signal_at(4, signal.SIGTERM))
         before = file.read_bytes()
@@ -519,8 +554,9 @@ class TestBadInput:
             return batch
 
         monkeypatch.setattr(RelabelGoals, "forward", spoiled)
+        training = replace(SHORT, log_interval=log_interval, checkpoint_interval=6)
         with pytest.raises(FloatingPointError, match=r"after 6 updates .*loss_model_proprio.* is not finite"):
-            train(fresh(), dataset, tmp_path)
+            train(fresh(), dataset, tmp_path, training)
         assert file.read_bytes() == before
 
 
