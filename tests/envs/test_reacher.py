@@ -184,7 +184,7 @@ def test_finer_masks_are_sampled_at_the_size_of_the_images(env):
 
 def pictures(diameter: int, goal, seed: int = 17):
     """Observations of the same state without and with a virtual target."""
-    plain, painted = Reacher(), Reacher(virtual_target=diameter)
+    plain, painted = Reacher(privileged=True), Reacher(virtual_target=diameter, privileged=True)
     both = [env.reset(seed=seed, options={"goal_position": goal})[0] for env in (plain, painted)]
     both += [env.step(np.ones(2))[0] for env in (plain, painted)]
     plain.close()
