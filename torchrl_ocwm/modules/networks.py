@@ -20,8 +20,8 @@ from torchrl.modules import (
 )
 
 from torchrl_ocwm.modules.architecture import Architecture, Style
-from torchrl_ocwm.modules.choices import check_choice
 from torchrl_ocwm.modules.dtypes import unit_image
+from torchrl_ocwm.settings import read
 
 UNIMIX = 0.01
 
@@ -43,7 +43,7 @@ def make_mlp(
         >>> make_mlp("dreamer_v2", 5, 3, layers=1, units=8, outscale=0.0)(torch.ones(2, 4), torch.ones(2, 1))[0]
         tensor([0., 0., 0.], grad_fn=<SelectBackward0>)
     """
-    check_choice("style", style, Style)
+    read(Style, style, "style")
     if style == "dreamer_v3":
         return DreamerV3MLP(in_features, out_features, depth=layers, num_cells=units, outscale=outscale)
     if out_features is None:

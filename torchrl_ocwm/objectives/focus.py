@@ -11,9 +11,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
-from torchrl_ocwm.modules.choices import check_choice
 from torchrl_ocwm.modules.dtypes import flags, unit_image
 from torchrl_ocwm.objectives.world_model import Term, WorldModelLoss, visible_position_reconstruction
+from torchrl_ocwm.settings import read
 
 LatentDistance = Literal["cosine", "mse"]
 PositionalGradient = Literal["encoder", "latent", "both"]
@@ -100,8 +100,8 @@ def positional_latent_loss(
         >>> positional_latent_loss(latent, 2 * latent, torch.tensor([[True]]))
         tensor(-1.)
     """
-    check_choice("distance", distance, LatentDistance)
-    check_choice("gradient", gradient, PositionalGradient)
+    read(LatentDistance, distance, "distance")
+    read(PositionalGradient, gradient, "gradient")
     if gradient == "encoder":
         extracted = extracted.detach()
     elif gradient == "latent":
