@@ -195,10 +195,12 @@ class FOCUSModelLoss(WorldModelLoss):
         for name, value in (("positional_distance", positional_distance), ("positional_gradient", positional_gradient)):
             if value is not None:
                 self._given[name] = "positional"
-        self.positional_distance: LatentDistance = positional_distance or "cosine"
-        self.positional_gradient: PositionalGradient = positional_gradient or "both"
-        check_choice("positional_distance", self.positional_distance, LatentDistance)
-        check_choice("positional_gradient", self.positional_gradient, PositionalGradient)
+        self.positional_distance: LatentDistance = read(
+            LatentDistance, positional_distance or "cosine", "positional_distance"
+        )
+        self.positional_gradient: PositionalGradient = read(
+            PositionalGradient, positional_gradient or "both", "positional_gradient"
+        )
 
     def terms(self) -> dict[str, Term]:
         """Masks and masked colours in place of the image, and what the two kinds of goals are encoded with."""
