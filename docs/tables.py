@@ -171,11 +171,9 @@ def part(value: Part) -> str:
     """A part's name, and those of its settings that are not the default."""
     known = value.name_and_kind()
     assert known is not None
-    changed = {one.name: getattr(value, one.name) for one in fields(value)}
-    given = ", ".join(
-        f"{one.name}: {written_out(changed[one.name])}" for one in fields(value) if changed[one.name] != one.default
-    )
-    return code(f"{{name: {known[0]}, {given}}}" if given else known[0])
+    given = {one.name: getattr(value, one.name) for one in fields(value) if getattr(value, one.name) != one.default}
+    changed = ", ".join(code(f"{name}={written_out(one)}") for name, one in given.items())
+    return f"{code(known[0])} with {changed}" if changed else code(known[0])
 
 
 def written_out(value: Any) -> str:
