@@ -6,11 +6,14 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
+from pkgutil import walk_packages
 from types import ModuleType
 
 import pytest
 
+import torchrl_ocwm
 from torchrl_ocwm.agents import AGENTS, AgentConfig, Size
 from torchrl_ocwm.agents.checkpoint import Description
 from torchrl_ocwm.envs import ENVIRONMENTS, Task, Workspace
@@ -92,9 +95,16 @@ def test_every_settings_class_has_a_table() -> None:
 
 
 def subclasses(kind: type) -> Iterator[type]:
+    """All classes below a class, in all modules of the library."""
+    for module in walk_packages(torchrl_ocwm.__path__, "torchrl_ocwm."):
+        import_module(module.name)
+    return below(kind)
+
+
+def below(kind: type) -> Iterator[type]:
     for one in kind.__subclasses__():
         yield one
-        yield from subclasses(one)
+        yield from below(one)
 
 
 def recipes_of(kind: type) -> set[str]:
