@@ -17,6 +17,8 @@ from torchrl_ocwm.agents import AGENTS, Agent, build_agent
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records, reacher_task
 
+collect_ignore = ["plugin/ocwm_example"]  # a package that the tests import when they want its parts
+
 
 @pytest.fixture(autouse=True)
 def _seed() -> None:

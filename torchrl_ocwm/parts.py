@@ -139,6 +139,10 @@ def foreign(settings: Any) -> dict[str, str]:
 def absent(parts: Any) -> list[str]:
     """Which of the parts that :func:`foreign` gave, here or elsewhere, are not registered here; in words."""
     load_plugins()
-    known = {f"{kind} {name}" for kind, names in Part.registered.items() for name in names}
     given = parts.items() if isinstance(parts, Mapping) else ()
-    return [f"{part} (of package {package!r})" for part, package in given if part not in known]
+    unknown = [
+        (*part.split(" ", 1), package)
+        for part, package in given
+        if part not in {f"{kind} {name}" for kind, names in Part.registered.items() for name in names}
+    ]
+    return [f"{kind} {name!r} of the package {package!r}" for kind, name, package in unknown]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
@@ -35,7 +35,7 @@ class Environment(NamedTuple):
 
     name: str
     id: str
-    entry_point: str | type[Any]
+    entry_point: str | Callable[..., Any]
     options: type[Settings] = EnvOptions
     modules: tuple[str, ...] = ()
     extra: str = ""
@@ -47,7 +47,7 @@ ENVIRONMENTS: dict[str, Environment] = {}
 
 def register_environment(
     name: str,
-    entry_point: str | type[Any],
+    entry_point: str | Callable[..., Any],
     *,
     options: type[Settings] = EnvOptions,
     modules: tuple[str, ...] = (),
@@ -228,7 +228,7 @@ def _look_up(name: str) -> Environment | None:
     return found()
 
 
-def _place(entry_point: str | type[Any]) -> str:
+def _place(entry_point: str | Callable[..., Any]) -> str:
     return entry_point if isinstance(entry_point, str) else f"{entry_point.__module__}:{entry_point.__qualname__}"
 
 
