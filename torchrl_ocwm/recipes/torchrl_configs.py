@@ -21,7 +21,8 @@ from torchrl_ocwm.agents import AgentConfig, OptimizerPart, Size, build_agent
 from torchrl_ocwm.envs.registry import EnvChoice, make_env, make_task
 from torchrl_ocwm.objectives import GoalConditionedDreamerLoss
 from torchrl_ocwm.parts import Part
-from torchrl_ocwm.settings import from_dict, to_dict
+from torchrl_ocwm.recipes.config import defaults
+from torchrl_ocwm.settings import from_dict
 
 _HERE = __name__
 
@@ -108,9 +109,8 @@ def store() -> None:
     configs.store(group="loss", name="ocwm", node=OCWMLossConfig)
     target = {"_target_": f"{_HERE}.make_optimizer", "_partial_": True, "lr": 3e-4}
     for name in OptimizerPart.names():
-        configs.store(
-            group="optimizer", name=f"ocwm_{name}", node={**target, **to_dict(Part.registered["optimizer"][name]())}
-        )
+        part = {"name": name, **defaults(Part.registered[OptimizerPart.kind][name])}
+        configs.store(group="optimizer", name=f"ocwm_{name}", node={**target, **part})
 
 
 def _plain(values: Any) -> Any:
