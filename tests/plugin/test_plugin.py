@@ -18,8 +18,9 @@ from torchrl_ocwm import build_agent, load_agent, make_env, make_task
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, Behaviour, save_agent
 from torchrl_ocwm.agents.checkpoint import describe, read_parts
 from torchrl_ocwm.data import EpisodeDataset
-from torchrl_ocwm.envs import ENVIRONMENTS, EnvChoice, find_environment
-from torchrl_ocwm.parts import VARIABLE, Part, load_plugins
+from torchrl_ocwm.envs import EnvChoice, find_environment
+from torchrl_ocwm.evaluation import EvaluationEnvs
+from torchrl_ocwm.parts import VARIABLE, load_plugins
 from torchrl_ocwm.settings import SettingsError, change, to_dict
 from torchrl_ocwm.testing import random_records, reacher_task
 
@@ -27,19 +28,14 @@ HERE, ROOT = Path(__file__).parent, Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module", autouse=True)
-def plugin() -> Iterator[None]:
+def plugin(registries: None) -> Iterator[None]:
     """The package can be found, and is gone afterwards."""
-    tables = [AGENTS, ENVIRONMENTS, *Part.registered.values()]
-    before = [dict(table) for table in tables]
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(HERE)
         patch.setenv("PYTHONPATH", os.pathsep.join([str(HERE), str(ROOT), os.environ.get("PYTHONPATH", "")]))
         patch.setenv(VARIABLE, "ocwm_example")
         load_plugins.cache_clear()
         yield
-    for table, content in zip(tables, before, strict=True):
-        table.clear()
-        table.update(content)
     for name in [name for name in sys.modules if name.split(".")[0] == "ocwm_example"]:
         del sys.modules[name]
     load_plugins.cache_clear()
@@ -175,7 +171,8 @@ def test_from_collected_data_to_a_table(tmp_path: Path) -> None:
     assert "60 steps in 4 episodes" in done.stdout, done.stderr
     assert EpisodeDataset.open(data).task.name == "dots"
     training = ("updates=2", "eval_interval=2", "eval_episodes=2", "eval_steps=3", "video_interval=0")
-    parts = ("agent=nearness", "agent.behaviours.reach.reward.width=0.3", "agent.behaviours.reach.goals=remembered")
+    reach = ("reward.width=0.3", "goals=remembered", "object=blue")
+    parts = ("agent=nearness", *(f"agent.behaviours.reach.{one}" for one in reach))
     more = ("size=debug", "size.learning.optimizer=sgd", *(f"training.{one}" for one in training))
     done = example("train_offline.py", "env=dots", f"dataset={data}", f"output={run}", *parts, *more)
     assert done.returncode == 0, done.stderr
@@ -184,9 +181,14 @@ def test_from_collected_data_to_a_table(tmp_path: Path) -> None:
     small = ("goals=4", "episode_steps=3", "workers=1", "envs=4", "video_goals=1", f"output={output}")
     done = example("evaluate.py", f"checkpoint={run / 'checkpoint.zip'}", *small)
     assert done.returncode == 0, done.stderr
-    rows = json.loads((output / "results.json").read_text())["agents"]
-    assert list(rows) == [
-        "random",
-        "nearness (behaviours.reach.reward.width=0.3, behaviours.reach.goals.name=remembered, "
-        "behaviours.reach.goals.number=3)",
-    ]
+    results = json.loads((output / "results.json").read_text())
+    name = next(row for row in results["agents"] if row != "random")
+    assert "behaviours.reach.reward.width=0.3" in name
+    assert results["settings"]["object"] == "blue"
+    policy = load_agent(run / "checkpoint.zip")
+    goals = torch.tensor(results["goals"])
+    with EvaluationEnvs(policy.agent.task, episode_steps=3, workers=0, envs=4) as envs:
+        episodes = envs.run(policy, goals)
+    away = (episodes["object_position_true"][:, -1, 1] - goals).norm(dim=-1)
+    scored = torch.tensor(results["agents"][name]["per_goal"][0]["final_distance"])
+    torch.testing.assert_close(scored, away, atol=1e-4, rtol=0)

@@ -14,7 +14,7 @@ from torchrl_ocwm.settings import setting
 @agents.register("nearness")
 @dataclass(frozen=True)
 class Nearness(agents.Reward):
-    """exp(−d / width), with the distance d of the object from its goal.
+    """One at the goal, and less with the distance from it, exponentially.
 
     Args:
         width: Metres in which it falls to 1/e.
