@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from torchrl_ocwm.agents.config import AgentConfig, Size
 from torchrl_ocwm.agents.presets import flat
 from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.parts import VARIABLE, absent, foreign
 from torchrl_ocwm.settings import Settings, SettingsError, from_dict, to_dict
 
 
@@ -75,17 +77,24 @@ class Description(Settings):
         size: How large it is, and how it learns.
         task: What it is for.
         release: The release of this library that wrote it.
+        plugins: The parts of other packages in it, and the packages, to say what is missing.
     """
 
     agent: AgentConfig
     size: Size
     task: Task
     release: str
+    plugins: Mapping[str, str] = field(default_factory=dict)
 
 
 def describe(agent: Agent) -> dict[str, Any]:
-    """What it takes to build an agent again; fits in JSON."""
-    return to_dict(Description(agent.config, agent.size, agent.task, __version__))
+    """What it takes to build an agent again; fits in JSON.
+
+    Raises:
+        SettingsError: for a part that is not registered, and could not be built again.
+    """
+    plugins = {**foreign(agent.config), **foreign(agent.size)}
+    return to_dict(Description(agent.config, agent.size, agent.task, __version__, plugins))
 
 
 def rebuild(description: Any) -> Agent:
@@ -111,6 +120,11 @@ def read_parts(description: Any) -> Description:
     try:
         return from_dict(Description, description)
     except SettingsError as error:
+        if missing := absent(description.get("plugins") if isinstance(description, dict) else None):
+            raise CheckpointError(
+                f"the agent has parts that are not registered here: {', '.join(missing)}; install what registers them, "
+                f"or name it in {VARIABLE}"
+            ) from error
         if release == __version__:
             raise CheckpointError(f"the checkpoint is damaged: {error}") from error
         raise CheckpointError(

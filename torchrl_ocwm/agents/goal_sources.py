@@ -67,7 +67,7 @@ class FrameGoalSource(GoalSource):
     def build(self, dim: int, goal: GoalEncoding) -> TensorDictModuleBase:
         """The goals that the frames are, shuffled."""
         del dim
-        return FrameGoals(goal.frame)
+        return FrameGoals(goal.frame, object_index=goal.object_index)
 
 
 @register("mixed")

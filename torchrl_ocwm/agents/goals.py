@@ -26,6 +26,7 @@ class GoalEncoding(NamedTuple):
         image: Encodes images ``[..., F, 3, H, W]`` uint8, if it can be done.
         frame: Writes ``("latent", "goal")``, the goal that a frame of the records is.
         directions: Whether only its direction means something; its length is then the same for all goals.
+        object_index: Which object it is about: that has to be seen in a frame that is a goal.
     """
 
     features: int
@@ -33,6 +34,7 @@ class GoalEncoding(NamedTuple):
     image: nn.Module | None
     frame: TensorDictModuleBase
     directions: bool = False
+    object_index: int = 0
 
 
 class Goal(Part, kind="goal"):
@@ -66,7 +68,8 @@ class Position(Goal):
         """The position as it is."""
         dim = scene.model.units.dim
         select = nn.Sequential(nn.Unflatten(-1, (-1, dim)), SelectObject(scene.object_index))
-        return GoalEncoding(dim, nn.Identity(), None, TensorDictModule(select, ["object_units"], [GOAL]))
+        frame = TensorDictModule(select, ["object_units"], [GOAL])
+        return GoalEncoding(dim, nn.Identity(), None, frame, object_index=scene.object_index)
 
 
 @register("object_latent")
@@ -106,7 +109,7 @@ class ObjectLatent(Goal):
         position = nn.Sequential(_LatentAtGoal(model.positional_encoder, index), length)
         image = nn.Sequential(model.latents_in_images(), SelectObject(index), length)
         frame = TensorDictModule(nn.Sequential(SelectObject(index), length), ["image_latent"], [GOAL])
-        return GoalEncoding(model.positional_encoder.features, position, image, frame, directions)
+        return GoalEncoding(model.positional_encoder.features, position, image, frame, directions, index)
 
 
 def object_centric(model: nn.Module) -> ObjectWorldModel:

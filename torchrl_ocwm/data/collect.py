@@ -27,7 +27,7 @@ from torchrl_ocwm.data.policies import ScriptedPolicy, SmoothRandomPolicy
 from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
 from torchrl_ocwm.data.settings import Collection
-from torchrl_ocwm.envs import ScriptedAction, Task, make_env, make_task
+from torchrl_ocwm.envs import ScriptedAction, Task, find_environment, make_env, make_task
 from torchrl_ocwm.processes import Make, Worker, make_worker
 
 #: What a dataset keeps of an environment's observations.
@@ -106,7 +106,7 @@ def collect(
         settings = Collection(steps=settings, **more)
     options = options or {}
     task = make_task(environment, **options)
-    source = {"environment": environment, "options": options, "task": task.to_dict()}
+    source = {"environment": task.name, "options": options, "task": task.to_dict()}
     name, module = make_policy(settings.policy if policy is None else policy, task)
     dataset = _open_if_there(Path(path), source)
     if dataset is not None and dataset.num_steps >= settings.steps:
@@ -115,7 +115,10 @@ def collect(
     done = dataset.num_steps if dataset is not None else 0
 
     make_player = partial(
-        EpisodePlayer, partial(make_env, environment, **{**options, "privileged": True}), module, settings.seed
+        EpisodePlayer,
+        partial(make_env, find_environment(environment), **{**options, "privileged": True}),
+        module,
+        settings.seed,
     )
     played = play_in_order(make_player, settings, first=_next_number(dataset))
     bar = tqdm(total=settings.steps, initial=done, unit="step", desc=f"collect {environment}", disable=not progress)

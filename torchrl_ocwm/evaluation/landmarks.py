@@ -32,7 +32,7 @@ class LandmarkEvaluation:
 
     def __call__(self, updates: int) -> dict[str, float]:  # noqa: ARG002
         """Scores to log."""
-        scores = measure(self.envs.run(self.policy, self.goals))
+        scores = measure(self.envs.run(self.policy, self.goals), object_index=self.policy.object_index)
         return {f"evaluation/{name}": float(values.nanmean()) for name, values in scores.items()}
 
     def close(self) -> None:

@@ -72,7 +72,7 @@ def store_options() -> None:
         for name, row in rows.items():
             store.store(name, to_dict(row), group=group)
     for name, environment in ENVIRONMENTS.items():
-        store.store(name, {"name": name, "options": to_dict(environment.options())}, group="env")
+        store.store(name, {"name": name, "options": defaults(environment.options)}, group="env")
 
 
 def keep_settings(settings: Any, folder: Path) -> None:
@@ -110,14 +110,25 @@ def help_lines(kind: type, at: str = "") -> Iterator[str]:
             yield f"{name}{value}: {docs.get(one.name, '')}"
 
 
+def defaults(kind: type) -> dict[str, Any]:
+    """The fields of a settings class with their defaults; ``"???"``, as Hydra has it, for what has to be given.
+
+    Examples:
+        >>> from torchrl_ocwm.agents import DreamerV3
+        >>> defaults(DreamerV3)
+        {'warmup': 0}
+    """
+    return {one.name: _default(one) for one in fields(kind)}
+
+
 def _schema(kind: type, groups: Mapping[str, str], more: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration of a recipe: its groups, and all other settings with their defaults."""
-    plain = {one.name: _default(one) for one in fields(kind) if one.name not in groups}
-    defaults: list[Any] = [{group: choice} for group, choice in groups.items()]
+    plain = {name: value for name, value in defaults(kind).items() if name not in groups}
+    chosen: list[Any] = [{group: choice} for group, choice in groups.items()]
     quiet = [{f"override hydra/{part}": "none"} for part in _QUIET]
     text = "\n".join(help_lines(kind)).replace("$", "")
     own = {"run": {"dir": "."}, "output_subdir": None, "help": {"header": f"Settings:\n{text}\n"}, **more}
-    return {"defaults": [*defaults, "_self_", *quiet], **plain, "hydra": own}
+    return {"defaults": [*chosen, "_self_", *quiet], **plain, "hydra": own}
 
 
 def _default(one: Any) -> Any:

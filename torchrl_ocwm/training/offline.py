@@ -176,7 +176,7 @@ def _make_sampler(agent: Agent, dataset: EpisodeDataset, training: Training) -> 
         dataset,
         batch_size=agent.size.learning.batch_size,
         slice_len=agent.size.learning.slice_len,
-        transform=RelabelGoals(agent.task.workspace, goals=training.goals),
+        transform=RelabelGoals(agent.task.workspace, goals=training.goals, object_index=agent.recorded_object),
     )
 
     def sample(batch: TensorDictBase | None = None) -> TensorDictBase:  # noqa: ARG001
