@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from torchrl_ocwm.agents.goal_sources import EnvironmentGoals, GoalSource
 from torchrl_ocwm.agents.goals import Goal, NoGoal
@@ -15,6 +15,8 @@ from torchrl_ocwm.settings import Settings, SettingsError, setting
 
 #: The behaviour that acts unless another is asked for.
 REACH = "reach"
+#: The behaviour that explores, where there is one.
+EXPLORE = "explore"
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,16 @@ class AgentConfig(Settings):
     def acting(self) -> str:
         """The behaviour that acts: ``reach``, or the first if there is none of this name."""
         return REACH if REACH in self.behaviours else next(iter(self.behaviours))
+
+    def and_behaviours(self, **behaviours: Behaviour) -> AgentConfig:
+        """The same row with more behaviours beside its own, by name.
+
+        Examples:
+            >>> from torchrl_ocwm.agents import AGENTS, EXPLORERS
+            >>> list(AGENTS["dreamer_pcp"].and_behaviours(explore=EXPLORERS["plan2explore"]).behaviours)
+            ['reach', 'explore']
+        """
+        return replace(self, behaviours={**self.behaviours, **behaviours})
 
 
 @dataclass(frozen=True, kw_only=True)
