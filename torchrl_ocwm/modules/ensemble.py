@@ -86,7 +86,8 @@ class OneStepEnsemble(nn.Module):
         *first, last = self.layers
         for layer in first:
             hidden = self._activate(layer(hidden))
-        return last(hidden).unflatten(1, inputs.shape[:-1])
+        predictions = last(hidden)
+        return predictions.reshape(len(predictions), *inputs.shape[:-1], -1)
 
     def _activate(self, hidden: Tensor) -> Tensor:
         return silu(rms_norm(hidden, hidden.shape[-1:])) if self.style == "dreamer_v3" else elu(hidden)
