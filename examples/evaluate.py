@@ -74,7 +74,7 @@ class Evaluate(Evaluation):
 def main(config: Evaluate) -> None:
     settings = config
     files = [Path(one) for one in ([config.checkpoint] if isinstance(config.checkpoint, str) else config.checkpoint)]
-    policies = [load_agent(file) for file in files]
+    policies = [load_agent(file, behaviour=settings.behaviour) for file in files]
     task, about, output = _one_task(policies, files), policies[0].object_index, Path(config.output)
     goals = task.workspace.grid(settings.grid_size).flatten(0, 1)
     images = goal_images(task, goals, object_index=about) if settings.image_goals else None
@@ -91,7 +91,7 @@ def main(config: Evaluate) -> None:
             played = envs.run(SmoothRandomPolicy(task.action), goals, seed=settings.seed, progress=True)
             report.add("random", measure(played, object_index=about), source="smooth actions")
         for policy, run in zip(policies, runs, strict=True):
-            name = agent_name(policy.agent.config)
+            name = agent_name(policy.agent.config) + (f", {settings.behaviour}" if settings.behaviour else "")
             report.add(name, _evaluate(policy, envs, goals, settings.seed), **run)
             if images is not None and policy.takes_images:
                 report.add(name + IMAGE_GOALS, _evaluate(policy, envs, goals, settings.seed, images), **run)
@@ -168,7 +168,7 @@ def _evaluate(
     errors = {name: episodes[name].mean(1) for name in ("entity_error", "goal_error") if name in episodes}
     if "object_position" in policy.agent.model.observed:
         errors["imagined_distance"] = imagined_distance(
-            policy.agent,
+            policy.behaviour,
             episodes["latent"][:, 0],
             goals,
             envs.episode_steps,
@@ -199,7 +199,7 @@ def _film(
         return {"latent": step["latent"], **transition(step)}
 
     episodes = envs.run(policy, goals, images=images, seed=seed, numbers=chosen, inspect=inspect)
-    latents = imagined_rollout(policy.agent, episodes["latent"][:, 0], envs.episode_steps, seed=seed)["latent"]
+    latents = imagined_rollout(policy.behaviour, episodes["latent"][:, 0], envs.episode_steps, seed=seed)["latent"]
     imagined = decode_video(policy.agent.model, latents)
     with closing(make_scene(find_environment(task.name), **task.options)) as scene:
         points = torch.as_tensor(scene.project(goals.numpy()))

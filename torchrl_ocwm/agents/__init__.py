@@ -5,6 +5,7 @@ from torchrl_ocwm.agents.behaviour import LearntBehaviour
 from torchrl_ocwm.agents.build import build_agent
 from torchrl_ocwm.agents.checkpoint import load_agent, save_agent
 from torchrl_ocwm.agents.config import AgentConfig, Behaviour, Learning, Size
+from torchrl_ocwm.agents.explorers import Disagreement, ExplorationReward, ObjectEntropy, StateEntropy
 from torchrl_ocwm.agents.goal_sources import (
     EnvironmentGoals,
     FrameGoalSource,
@@ -14,7 +15,7 @@ from torchrl_ocwm.agents.goal_sources import (
 )
 from torchrl_ocwm.agents.goals import Goal, GoalEncoding, NoGoal, ObjectLatent, Position
 from torchrl_ocwm.agents.optimizers import Adam, DreamerV3, OptimizerPart
-from torchrl_ocwm.agents.presets import AGENTS, SIZES, agent_name
+from torchrl_ocwm.agents.presets import AGENTS, EXPLORERS, SIZES, agent_name
 from torchrl_ocwm.agents.rewards import (
     ImaginedReward,
     LatentChord,
@@ -30,14 +31,17 @@ from torchrl_ocwm.parts import register
 
 __all__ = [
     "AGENTS",
+    "EXPLORERS",
     "SIZES",
     "Adam",
     "Agent",
     "AgentConfig",
     "Architecture",
     "Behaviour",
+    "Disagreement",
     "DreamerV3",
     "EnvironmentGoals",
+    "ExplorationReward",
     "Flat",
     "FrameGoalSource",
     "Goal",
@@ -52,6 +56,7 @@ __all__ = [
     "MixedGoalSource",
     "NoGoal",
     "ObjectCentric",
+    "ObjectEntropy",
     "ObjectLatent",
     "OptimizerPart",
     "Policy",
@@ -60,6 +65,7 @@ __all__ = [
     "Reward",
     "Scene",
     "Size",
+    "StateEntropy",
     "UniformGoalSource",
     "WorldModelPart",
     "agent_name",

@@ -107,7 +107,7 @@ def collect(
     options = options or {}
     task = make_task(environment, **options)
     source = {"environment": task.name, "options": options, "task": task.to_dict()}
-    name, module = make_policy(settings.policy if policy is None else policy, task)
+    name, module = make_policy(settings.policy if policy is None else policy, task, settings.behaviour)
     dataset = _open_if_there(Path(path), source)
     if dataset is not None and dataset.num_steps >= settings.steps:
         with dataset:
@@ -136,11 +136,13 @@ def collect(
         return _with_coverage(dataset, task)
 
 
-def make_policy(policy: str | Path | TensorDictModuleBase, task: Task) -> tuple[str, TensorDictModuleBase]:
-    """A policy's name in the index of a dataset, and the module that acts.
+def make_policy(
+    policy: str | Path | TensorDictModuleBase, task: Task, behaviour: str | None = None
+) -> tuple[str, TensorDictModuleBase]:
+    """A policy's name in the index of a dataset, and the module that acts: of an agent, one of its behaviours.
 
     Raises:
-        ValueError: for an unknown name, or a checkpoint of another task's agent.
+        ValueError: for an unknown name, a checkpoint of another task's agent, or a behaviour that it does not have.
         CheckpointError: for a file that is no checkpoint of an agent.
     """
     if isinstance(policy, TensorDictModuleBase):
@@ -149,13 +151,13 @@ def make_policy(policy: str | Path | TensorDictModuleBase, task: Task) -> tuple[
         return str(policy), POLICIES[str(policy)](task.action)
     if not Path(policy).is_file():
         raise ValueError(f"unknown policy {str(policy)!r}; there are {', '.join(POLICIES)} and checkpoint files")
-    loaded = load_agent(policy)
+    loaded = load_agent(policy, behaviour=behaviour)
     if loaded.agent.task != task:
         raise ValueError(
             f"{policy}: the agent was trained for {loaded.agent.task.name!r} with options "
             f"{loaded.agent.task.options}, not for {task.name!r} with {task.options}"
         )
-    return str(policy), loaded
+    return f"{policy} ({behaviour})" if behaviour else str(policy), loaded
 
 
 class EpisodePlayer:

@@ -2,12 +2,15 @@
 
 from torchrl_ocwm.modules.acting import ActingLatent
 from torchrl_ocwm.modules.actor import Actor
+from torchrl_ocwm.modules.ensemble import DisagreementReward, OneStepEnsemble, disagreement
 from torchrl_ocwm.modules.goals import FrameGoals, GivenGoals, MixedGoals, UniformGoals, UnitRMS
 from torchrl_ocwm.modules.imagination import ImaginationEnv
 from torchrl_ocwm.modules.latent import InitialLatent, LatentOfImages
+from torchrl_ocwm.modules.normalization import StreamingNorm
 from torchrl_ocwm.modules.object_world_model import LatentsInImages, ObjectWorldModel
 from torchrl_ocwm.modules.objects import LatentPositionalEncoder, ObjectDecoder, ObjectLatentExtractor
 from torchrl_ocwm.modules.observation import ObservationEncoder
+from torchrl_ocwm.modules.particles import EntropyReward, particle_entropy
 from torchrl_ocwm.modules.rewards import (
     LatentSimilarityReward,
     PositionDistance,
@@ -20,6 +23,8 @@ from torchrl_ocwm.modules.world_model import FlatWorldModel, WorldModel
 __all__ = [
     "ActingLatent",
     "Actor",
+    "DisagreementReward",
+    "EntropyReward",
     "FlatWorldModel",
     "FrameGoals",
     "GivenGoals",
@@ -34,11 +39,15 @@ __all__ = [
     "ObjectLatentExtractor",
     "ObjectWorldModel",
     "ObservationEncoder",
+    "OneStepEnsemble",
     "PositionDistance",
     "PositionDistanceReward",
+    "StreamingNorm",
     "UniformGoals",
     "UnitRMS",
     "WorkspaceUnits",
     "WorldModel",
+    "disagreement",
+    "particle_entropy",
     "position_distance",
 ]

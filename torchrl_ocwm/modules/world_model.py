@@ -97,7 +97,7 @@ class WorldModel(nn.Module, ABC):
         rollout.in_keys = [*rollout.in_keys, "is_init"]  # TorchRL's takes it as optional: then memory crosses episodes
         return TensorDictSequential(
             InitialLatent(self.state, self.belief),
-            TensorDictModule(_bounded, ["action"], ["bounded_action"]),
+            TensorDictModule(bounded, ["action"], ["bounded_action"]),
             *self._encode("next"),
             rollout,
             *self.decoders("next"),
@@ -149,7 +149,7 @@ class WorldModel(nn.Module, ABC):
         """Next state and belief, sampled from the prior. Actions beyond [−1, 1] count as clipped."""
         latent = latent_at(("latent",))
         return TensorDictSequential(
-            TensorDictModule(_bounded, ["action"], ["bounded_action"]),
+            TensorDictModule(bounded, ["action"], ["bounded_action"]),
             TensorDictModule(self.prior, [*latent, "bounded_action"], ["_", *latent]),
         )
 
@@ -254,7 +254,7 @@ class _ObjectUnits(nn.Module):
         return self.units(metres).flatten(-2)
 
 
-def _bounded(action: Tensor) -> Tensor:
+def bounded(action: Tensor) -> Tensor:
     """Clip to [−1, 1] and keep a gradient beyond, as TorchRL's block GRU does by itself."""
     action = action.float()
     return action / action.detach().abs().clamp_min(1)

@@ -17,7 +17,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
-from torchrl_ocwm.agents import AGENTS, SIZES
+from torchrl_ocwm.agents import AGENTS, EXPLORERS, SIZES
+from torchrl_ocwm.agents.config import EXPLORE
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.files import replacing
@@ -38,7 +39,7 @@ def recipe(
 
     Args:
         name: Name of the recipe.
-        groups: Groups of options that it takes (``agent``, ``size``, ``env``), each with its default.
+        groups: Groups of options that it takes (``agent``, ``explore``, ``size``, ``env``), each with its default.
         more: Settings of Hydra itself.
     """
 
@@ -65,12 +66,15 @@ def recipe(
 
 
 def store_options() -> None:
-    """Put agents, sizes and environments into Hydra's store, those of plugins too."""
+    """Put agents, explorers, sizes and environments into Hydra's store, those of plugins too."""
     load_plugins()
     store = ConfigStore.instance()
     for group, rows in (("agent", AGENTS), ("size", SIZES)):
         for name, row in rows.items():
             store.store(name, to_dict(row), group=group)
+    store.store("none", {}, group="explore", package="_global_")
+    for name, behaviour in EXPLORERS.items():  # beside the behaviours of the row
+        store.store(name, to_dict(behaviour), group="explore", package=f"agent.behaviours.{EXPLORE}")
     for name, environment in ENVIRONMENTS.items():
         store.store(name, {"name": name, "options": defaults(environment.options)}, group="env")
 
