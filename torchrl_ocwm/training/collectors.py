@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.util import find_spec
 from itertools import count
@@ -104,7 +105,14 @@ def make_collector(
         chunk, whole = chunk * every, {**whole, "trajs_per_batch": every}
     with interrupts_ignored():
         return Collector(
-            envs, policy, num_collectors=every, sync=sync, frames_per_batch=chunk, total_frames=-1, **whole
+            envs,
+            policy,
+            num_collectors=every,
+            sync=sync,
+            frames_per_batch=chunk,
+            total_frames=-1,
+            num_threads=torch.get_num_threads(),  # of this process, which updates
+            **whole,
         )
 
 
@@ -114,10 +122,13 @@ def next_episodes(batches: Iterator[TensorDictBase], collector: BaseCollector, t
     Raises:
         RuntimeError: if a simulator fails, or a process has ended or hangs.
     """
-    with _ended_after(timeout, collector):
-        batch = next(batches)
+    try:
+        with _ended_after(timeout, collector):
+            batch = next(batches)
+    except _ray_errors() as error:
+        raise RuntimeError(str(error)) from error
     ends = batch["next", "done"].flatten().nonzero().flatten() + 1
-    episodes = batch.tensor_split(ends.tolist()[:-1]) if len(ends) > 1 else [batch]
+    episodes = batch.split(ends.diff(prepend=ends.new_zeros(1)).tolist())
     return sorted(episodes, key=lambda episode: int(episode[NUMBER][0]))
 
 
@@ -129,19 +140,26 @@ def end(collector: BaseCollector) -> None:
 
 def _kill(collector: BaseCollector) -> None:
     for process in getattr(collector, "procs", ()):
-        if process.is_alive():
+        with suppress(ValueError):  # it has ended, and TorchRL has noticed
             process.kill()
+    getattr(collector, "stop_remote_collectors", lambda: None)()
 
 
 @contextmanager
 def _ended_after(seconds: float, collector: BaseCollector) -> Iterator[None]:
     """Kill what hangs: TorchRL's collectors notice a process that has ended, but wait for one that hangs."""
     timer = Timer(seconds, _kill, [collector])
+    timer.daemon = True
     timer.start()
     try:
         yield
     finally:
         timer.cancel()
+
+
+def _ray_errors() -> tuple[type[Exception], ...]:
+    ray = sys.modules.get("ray.exceptions")
+    return () if ray is None else (ray.RayError,)
 
 
 def _numbered(make: Callable[[], EnvBase], seed: int, first: int, every: int) -> EnvBase:
@@ -150,13 +168,21 @@ def _numbered(make: Callable[[], EnvBase], seed: int, first: int, every: int) ->
 
 def _in_worker(make: Callable[[], EnvBase]) -> EnvBase:
     end_with_parent()
-    torch.set_num_threads(1)
     return make()
 
 
-def _ray_collector(envs: list[Callable[[], EnvBase]], policy: Turns, chunk: int, whole: dict[str, Any]) -> BaseCollector:
+def _ray_collector(
+    envs: list[Callable[[], EnvBase]], policy: Turns, chunk: int, whole: dict[str, Any]
+) -> BaseCollector:
     if find_spec("ray") is None:
         raise ModuleNotFoundError("collector=ray needs Ray: pip install 'torchrl-ocwm[ray]'", name="ray")
-    from torchrl.collectors.distributed import RayCollector
+    from torchrl.collectors.distributed.ray import DEFAULT_RAY_INIT_CONFIG, RayCollector
 
-    return RayCollector(envs, policy, frames_per_batch=chunk, total_frames=-1, collector_kwargs=whole)
+    return RayCollector(
+        envs,
+        policy,
+        frames_per_batch=chunk,
+        total_frames=sys.maxsize,
+        collector_kwargs=[dict(whole) for _ in envs],
+        ray_init_config={**DEFAULT_RAY_INIT_CONFIG, "log_to_driver": False, "logging_level": "warning"},
+    )
