@@ -1,4 +1,4 @@
-"""Train an agent that collects its own data: ``python examples/train_online.py agent=focus_lcp env=cube_move size=cpu``.
+"""Train an agent that collects its data: ``python examples/train_online.py agent=focus_lcp env=cube_move size=cpu``.
 
 Can be stopped (Ctrl-C, SIGTERM, killed) and run again: it goes on with the same dataset and checkpoint.
 ``train_offline.py`` can train on the dataset at any time.

@@ -99,13 +99,12 @@ def make_collector(
         return Collector(envs[0], policy, frames_per_batch=chunk, total_frames=-1, **whole)
     if online.collector == "ray":
         return _ray_collector(envs, policy, chunk, whole)
-    envs = [partial(_in_worker, one) for one in envs]
     sync = online.collector == "sync"
     if sync:
         chunk, whole = chunk * every, {**whole, "trajs_per_batch": every}
     with interrupts_ignored():
         return Collector(
-            envs,
+            [partial(_in_worker, one) for one in envs],
             policy,
             num_collectors=every,
             sync=sync,
@@ -172,14 +171,14 @@ def _in_worker(make: Callable[[], EnvBase]) -> EnvBase:
 
 
 def _ray_collector(
-    envs: list[Callable[[], EnvBase]], policy: Turns, chunk: int, whole: dict[str, Any]
+    envs: Sequence[Callable[[], EnvBase]], policy: Turns, chunk: int, whole: dict[str, Any]
 ) -> BaseCollector:
     if find_spec("ray") is None:
         raise ModuleNotFoundError("collector=ray needs Ray: pip install 'torchrl-ocwm[ray]'", name="ray")
     from torchrl.collectors.distributed.ray import DEFAULT_RAY_INIT_CONFIG, RayCollector
 
     return RayCollector(
-        envs,
+        list(envs),
         policy,
         frames_per_batch=chunk,
         total_frames=sys.maxsize,

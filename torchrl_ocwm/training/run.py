@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.archive import Archive, recover
 from torchrl_ocwm.agents.checkpoint import check_same_agent, describe
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals, make_replay_buffer
-from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.files import only_writer
 from torchrl_ocwm.training.hooks import Every, LossLog, ProgressBar, RunTrainer, StopOnSignals, UpdateClock
 from torchrl_ocwm.training.loggers import make_loggers
