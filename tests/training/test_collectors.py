@@ -174,7 +174,9 @@ def test_what_hangs_is_killed() -> None:
 def test_what_is_in_time_is_left_alone() -> None:
     killed = threading.Event()
     collector: Any = SimpleNamespace(procs=[SimpleNamespace(kill=killed.set)])
-    steps = TensorDict({NUMBER: torch.tensor([[7], [7], [2]]), "next": {"done": torch.tensor([[0], [1], [1]]) > 0}}, [3])
+    steps = TensorDict(
+        {NUMBER: torch.tensor([[7], [7], [2]]), "next": {"done": torch.tensor([[0], [1], [1]]) > 0}}, [3]
+    )
     episodes = next_episodes(iter([steps]), collector, timeout=0.3)
     assert numbers(episodes) == [2, 7]
     assert [len(episode) for episode in episodes] == [1, 2]
