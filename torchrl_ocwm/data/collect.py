@@ -111,7 +111,7 @@ def collect(
     dataset = _open_if_there(Path(path), source)
     if dataset is not None and dataset.num_steps >= settings.steps:
         with dataset:
-            return _with_coverage(dataset, task)
+            return with_coverage(dataset, task)
     done = dataset.num_steps if dataset is not None else 0
 
     make_player = partial(
@@ -128,12 +128,12 @@ def collect(
         for records, failures in episodes:
             if dataset is None:
                 dataset = writing.enter_context(EpisodeDataset.create(path, example=records[0], metadata=source))
-            dataset.append(records, **_count(dataset, name, failures), coverage=None)
+            dataset.append(records, **count_episode(dataset, name, failures), coverage=None)
             bar.update(len(records) - 1)
             if dataset.num_steps >= settings.steps:
                 break
         assert dataset is not None
-        return _with_coverage(dataset, task)
+        return with_coverage(dataset, task)
 
 
 def make_policy(
@@ -227,7 +227,7 @@ def play_in_order(
                 episode = players[turn].answer()
             except RuntimeError as error:  # of the simulator, or of a process that died or hangs
                 failures += 1
-                _check_failures(failures, error)
+                check_failures(failures, error)
                 players[turn].close()
                 players[turn] = begin()
                 players[turn].ready()
@@ -240,7 +240,8 @@ def play_in_order(
             player.close()
 
 
-def _check_failures(failures: int, error: RuntimeError) -> None:
+def check_failures(failures: int, error: RuntimeError) -> None:
+    """Warn of an episode that failed, or raise if too many did so in a row."""
     if isinstance(error, NotImplementedError):
         raise error
     if failures > MAX_FAILURES:
@@ -253,14 +254,15 @@ def _next_number(dataset: EpisodeDataset | None) -> int:
     return 0 if dataset is None else len(dataset.episode_lengths) + dataset.metadata.get("failures", 0)
 
 
-def _count(dataset: EpisodeDataset, policy: str, failures: int) -> dict[str, Any]:
+def count_episode(dataset: EpisodeDataset, policy: str, failures: int) -> dict[str, Any]:
     """The index's counts with one more episode."""
     counts = Counter(dataset.metadata.get("policies", {}))
     counts[policy] += 1
     return {"policies": dict(counts), "failures": dataset.metadata.get("failures", 0) + failures}
 
 
-def _with_coverage(dataset: EpisodeDataset, task: Task) -> EpisodeDataset:
+def with_coverage(dataset: EpisodeDataset, task: Task) -> EpisodeDataset:
+    """The dataset, which is open for writing, with the coverage of its episodes in its index."""
     if dataset.metadata.get("coverage") is None:
         coverage = dataset_coverage(dataset, task.objects, task.workspace)
         dataset.annotate(coverage={name: seen._asdict() for name, seen in coverage.items()})
