@@ -52,10 +52,18 @@ class ObservationEncoder(nn.Module):
             return pad(image, (0, self.features - image.shape[-1]))
         return torch.cat([image, self.mlp(symlog(torch.cat(vectors, -1).float()))], -1)
 
+    @property
+    def image_features(self) -> int:
+        """How many of the features are of the image."""
+        return self.features - (0 if self.mlp is None else self.mlp_units)
+
+    def image_part(self, embedding: Tensor) -> Tensor:
+        """What of an embedding ``[..., features]`` is of the image, ``[..., image_features]``."""
+        return embedding[..., : self.image_features]
+
     def image_alone(self, embedding: Tensor) -> Tensor:
         """Embeddings ``[..., features]`` of image and vectors to those that the images have without vectors."""
-        vectors = 0 if self.mlp is None else self.mlp_units
-        return pad(embedding[..., : self.features - vectors], (0, vectors))
+        return pad(self.image_part(embedding), (0, self.features - self.image_features))
 
     def _check(self, pixels: Tensor, vectors: tuple[Tensor, ...]) -> None:
         expected = (3, self.image_size, self.image_size)
