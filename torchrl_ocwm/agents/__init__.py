@@ -8,20 +8,23 @@ from torchrl_ocwm.agents.config import AgentConfig, Behaviour, Learning, Size
 from torchrl_ocwm.agents.goal_sources import (
     EnvironmentGoals,
     FrameGoalSource,
+    FutureGoalSource,
     GoalSource,
     MixedGoalSource,
     UniformGoalSource,
 )
-from torchrl_ocwm.agents.goals import Goal, GoalEncoding, NoGoal, ObjectLatent, Position
+from torchrl_ocwm.agents.goals import FullLatent, Goal, GoalEncoding, ImageEmbedding, NoGoal, ObjectLatent, Position
 from torchrl_ocwm.agents.optimizers import Adam, DreamerV3, OptimizerPart
 from torchrl_ocwm.agents.presets import AGENTS, SIZES, agent_name
 from torchrl_ocwm.agents.rewards import (
+    FullLatentCosine,
     ImaginedReward,
     LatentChord,
     LatentSimilarity,
     LearnedReward,
     PositionDistance,
     Reward,
+    TemporalDistance,
 )
 from torchrl_ocwm.agents.scene import Scene
 from torchrl_ocwm.agents.world_models import Flat, ObjectCentric, WorldModelPart
@@ -40,9 +43,13 @@ __all__ = [
     "EnvironmentGoals",
     "Flat",
     "FrameGoalSource",
+    "FullLatent",
+    "FullLatentCosine",
+    "FutureGoalSource",
     "Goal",
     "GoalEncoding",
     "GoalSource",
+    "ImageEmbedding",
     "ImaginedReward",
     "LatentChord",
     "LatentSimilarity",
@@ -60,6 +67,7 @@ __all__ = [
     "Reward",
     "Scene",
     "Size",
+    "TemporalDistance",
     "UniformGoalSource",
     "WorldModelPart",
     "agent_name",

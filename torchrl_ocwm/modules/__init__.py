@@ -2,18 +2,21 @@
 
 from torchrl_ocwm.modules.acting import ActingLatent
 from torchrl_ocwm.modules.actor import Actor
+from torchrl_ocwm.modules.future_goals import FutureGoals
 from torchrl_ocwm.modules.goals import FrameGoals, GivenGoals, MixedGoals, UniformGoals, UnitRMS
 from torchrl_ocwm.modules.imagination import ImaginationEnv
-from torchrl_ocwm.modules.latent import InitialLatent, LatentOfImages
-from torchrl_ocwm.modules.object_world_model import LatentsInImages, ObjectWorldModel
+from torchrl_ocwm.modules.latent import FullLatent, InitialLatent, LatentOfImages, LatentsInImages
+from torchrl_ocwm.modules.object_world_model import ObjectWorldModel
 from torchrl_ocwm.modules.objects import LatentPositionalEncoder, ObjectDecoder, ObjectLatentExtractor
 from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.rewards import (
+    FullLatentReward,
     LatentSimilarityReward,
     PositionDistance,
     PositionDistanceReward,
     position_distance,
 )
+from torchrl_ocwm.modules.temporal_distance import TemporalDistance, TemporalDistanceReward
 from torchrl_ocwm.modules.units import WorkspaceUnits
 from torchrl_ocwm.modules.world_model import FlatWorldModel, WorldModel
 
@@ -22,6 +25,9 @@ __all__ = [
     "Actor",
     "FlatWorldModel",
     "FrameGoals",
+    "FullLatent",
+    "FullLatentReward",
+    "FutureGoals",
     "GivenGoals",
     "ImaginationEnv",
     "InitialLatent",
@@ -36,6 +42,8 @@ __all__ = [
     "ObservationEncoder",
     "PositionDistance",
     "PositionDistanceReward",
+    "TemporalDistance",
+    "TemporalDistanceReward",
     "UniformGoals",
     "UnitRMS",
     "WorkspaceUnits",
