@@ -45,7 +45,8 @@ from torchrl_ocwm.signals import ended_by_signals
 from torchrl_ocwm.training.offline import CHECKPOINT
 
 CONTEXT = 5  # frames that are seen before the objects are imagined
-IMAGE_GOALS = ", image goals"
+IMAGE_GOALS = ", image goals"  # after the name of a row; without it goals are positions
+FILMS = {"": "episodes.mp4", IMAGE_GOALS: "episodes_image_goals.mp4"}
 CURVES = {
     "evaluation/final_score": "final score, landmark goals",
     "return_high": "imagined return, 95th percentile",
@@ -77,7 +78,9 @@ def main(config: Evaluate) -> None:
     policies = [load_agent(file, behaviour=settings.behaviour) for file in files]
     task, about, output = _one_task(policies, files), policies[0].object_index, Path(config.output)
     goals = task.workspace.grid(settings.grid_size).flatten(0, 1)
-    images = goal_images(task, goals, object_index=about) if settings.image_goals else None
+    images = None
+    if settings.image_goals or not all(policy.takes_positions for policy in policies):
+        images = goal_images(task, goals, object_index=about)
     report = _report(goals, settings, config.include, {"object": task.objects[about]} if about else {})
     runs = _runs(files, policies, report)
     with EvaluationEnvs(
@@ -92,19 +95,27 @@ def main(config: Evaluate) -> None:
             report.add("random", measure(played, object_index=about), source="smooth actions")
         for policy, run in zip(policies, runs, strict=True):
             name = agent_name(policy.agent.config) + (f", {settings.behaviour}" if settings.behaviour else "")
-            report.add(name, _evaluate(policy, envs, goals, settings.seed), **run)
-            if images is not None and policy.takes_images:
-                report.add(name + IMAGE_GOALS, _evaluate(policy, envs, goals, settings.seed, images), **run)
+            for kind in _goal_kinds(policy, settings.image_goals):
+                scores = _evaluate(policy, envs, goals, settings.seed, images if kind == IMAGE_GOALS else None)
+                report.add(name + kind, scores, **run)
         report.save(output)
         print(report.markdown())
         _draw(report, task, output)
         if settings.video_goals:
             chosen = torch.linspace(0, len(goals) - 1, min(settings.video_goals, settings.goals)).round().long()
             film = partial(_film, policies[-1], envs, goals, chosen, settings.seed)
-            _picture_objects(policies[-1].agent, film(output / "episodes.mp4"), output)
-            if images is not None and policies[-1].takes_images:
-                film(output / "episodes_image_goals.mp4", images)
+            films = [
+                film(output / FILMS[kind], images if kind == IMAGE_GOALS else None)
+                for kind in _goal_kinds(policies[-1], settings.image_goals)
+            ]
+            _picture_objects(policies[-1].agent, films[0], output)
     print(f"\ntable, numbers, heatmap, learning curve, videos: {output}")
+
+
+def _goal_kinds(policy: Policy, image_goals: bool) -> list[str]:
+    """What goals a policy is evaluated with, by the end of its row's name: images too, or if it takes nothing else."""
+    positions = [""] if policy.takes_positions else []
+    return positions + [IMAGE_GOALS] * (policy.takes_images and (image_goals or not positions))
 
 
 def _report(goals: Tensor, settings: Evaluation, include: Sequence[str], more: dict[str, Any]) -> Report:
@@ -137,7 +148,9 @@ def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dic
 def _draw(report: Report, task: Task, output: Path) -> None:
     """Scores over the workspace, and how the agents of each row learnt."""
     heatmap(output / "heatmap.png", report.per_goal("final_score"), task.workspace, title="final score")
-    runs = {name: _folders(row.sources) for name, row in report.rows.items() if not name.endswith(IMAGE_GOALS)}
+    runs: dict[str, list[Path]] = {}
+    for name, row in report.rows.items():
+        runs.setdefault(name.removesuffix(IMAGE_GOALS), _folders(row.sources))
     learning_curves(output / "learning_curve.png", runs, CURVES)
 
 

@@ -36,6 +36,7 @@ class Policy(TensorDictSequential):
         agent: The agent that it belongs to.
         behaviour: The behaviour.
         takes_images: Whether goals can be given as images.
+        takes_positions: Whether they can be given as positions.
     """
 
     def __init__(self, agent: Agent, behaviour: LearntBehaviour, *modules: TensorDictModuleBase) -> None:
@@ -53,6 +54,11 @@ class Policy(TensorDictSequential):
     def object_index(self) -> int:
         """Which of the task's objects it is to position."""
         return self.behaviour.scene.object_index
+
+    @property
+    def takes_positions(self) -> bool:
+        goal = self.behaviour.goal
+        return goal is None or goal.position is not None
 
 
 class Agent(nn.Module):

@@ -17,7 +17,7 @@ class Evaluation(Settings):
         goals: Goals, laid out as a square grid over the reachable workspace.
         episode_steps: Steps per episode.
         image_goals: Also give the goals as images, what would be seen with the object there, to the agents that take
-            them.
+            both. Those that take nothing else get them anyway.
         random: Also evaluate smooth random actions.
         workers: Processes; 0 steps all environments in the process that evaluates. Scores do not depend on it.
         envs: Environments stepped in each process. Scores do not depend on it.
