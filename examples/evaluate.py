@@ -12,7 +12,6 @@ from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
-import gymnasium
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -40,6 +39,7 @@ from torchrl_ocwm.evaluation.settings import Evaluation
 from torchrl_ocwm.evaluation.videos import decode_video, mark, tile, write_video
 from torchrl_ocwm.modules import ObjectWorldModel
 from torchrl_ocwm.recipes import recipe
+from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.signals import ended_by_signals
 from torchrl_ocwm.training.offline import CHECKPOINT
 
@@ -119,14 +119,14 @@ def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dic
     """What a report keeps of each checkpoint: where it is, what is in it, and of what kind its agent is.
 
     Raises:
-        ValueError: for one that would count twice.
+        SettingsError: for one that would count twice.
     """
     seen = {run: source for row in report.rows.values() for run, source in zip(row.runs, row.sources, strict=True)}
     runs = []
     for file, policy in zip(files, policies, strict=True):
         run = sha256(file.read_bytes()).hexdigest()
         if run in seen:
-            raise ValueError(f"{file}: the same run as {seen[run]}, which counts already; leave one of them out")
+            raise SettingsError(f"{file}: the same run as {seen[run]}, which counts already; leave one of them out")
         seen[run] = str(file)
         kind = sha256(json.dumps(describe(policy.agent), sort_keys=True).encode()).hexdigest()
         runs.append({"source": str(file), "run": run, "kind": kind})
@@ -144,7 +144,7 @@ def _one_task(policies: list[Policy], files: list[Path]) -> Task:
     tasks = [policy.agent.task for policy in policies]
     for task, file in zip(tasks, files, strict=True):
         if task != tasks[0]:
-            raise ValueError(f"{file} is of {task}, {files[0]} of {tasks[0]}; evaluate them one after the other")
+            raise SettingsError(f"{file} is of {task}, {files[0]} of {tasks[0]}; evaluate them one after the other")
     return tasks[0]
 
 
@@ -193,6 +193,8 @@ def _film(
     episodes = envs.run(policy, goals, images=images, seed=seed, numbers=chosen, inspect=inspect)
     latents = imagined_rollout(policy.agent, episodes["latent"][:, 0], envs.episode_steps, seed=seed)["latent"]
     imagined = decode_video(policy.agent.model, latents)
+    import gymnasium
+
     with gymnasium.make(ENVIRONMENTS[task.name].id, **task.options) as env:
         points = torch.as_tensor(env.unwrapped.project(goals.numpy()))
     rows = [mark(episodes["transition", "next", "pixels"], points), mark(imagined, points)]

@@ -10,6 +10,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, ClassVar, TypeVar
 
+from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.settings import Settings, SettingsError, from_dict
 
 P = TypeVar("P", bound="type[Part]")
@@ -108,5 +109,10 @@ def load_plugins() -> None:
     """Import what installed packages and the environment variable ``TORCHRL_OCWM_PLUGINS`` name; once."""
     for point in entry_points(group=GROUP):
         point.load()
-    for module in filter(None, os.environ.get(VARIABLE, "").split(",")):
-        import_module(module.strip())
+    for module in filter(None, map(str.strip, os.environ.get(VARIABLE, "").split(","))):
+        try:
+            import_module(module)
+        except ModuleNotFoundError as error:
+            if error.name != module.partition(".")[0] and error.name != module:
+                raise  # the plugin's own
+            raise MissingPackageError(f"{VARIABLE}={module}: there is no such module", name=module) from error

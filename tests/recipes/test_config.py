@@ -6,9 +6,9 @@ from pathlib import Path
 import hydra
 import pytest
 from omegaconf import OmegaConf
+from torchrl_ocwm.training.config import check_overrides, to_dataclass
 
 from torchrl_ocwm.agents import AGENTS, SIZES, AgentConfig, Size
-from torchrl_ocwm.training.config import check_overrides, to_dataclass
 from torchrl_ocwm.training.settings import Training
 
 CONFIG = Path(__file__).parents[2] / "examples" / "config"

@@ -21,10 +21,11 @@ from torchrl_ocwm.agents import SIZES, Agent, build_agent, save_agent
 from torchrl_ocwm.agents.archive import Archive
 from torchrl_ocwm.agents.checkpoint import describe, rebuild
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals
+from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.evaluation import LandmarkEvaluation
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm
 from torchrl_ocwm.files import FolderInUseError
-from torchrl_ocwm.settings import change
+from torchrl_ocwm.settings import SettingsError, change
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
 from torchrl_ocwm.training import hooks
 from torchrl_ocwm.training.loggers import LogError
@@ -266,6 +267,19 @@ class TestLooking:
         train(through, dataset, tmp_path / "through")
         assert same(resumed, through)
 
+    @pytest.mark.parametrize(("error", "kind"), [(TypeError("a bug"), RuntimeError), (LogError("x"), EvaluationError)])
+    def test_only_what_a_user_can_mend_becomes_one_line(
+        self, dataset: EpisodeDataset, tmp_path: Path, error: Exception, kind: type
+    ) -> None:
+        def fails(updates: int) -> dict[str, float]:
+            raise error
+
+        with pytest.raises(RuntimeError, match="the checkpoint of this update is kept") as raised:
+            train(fresh(), dataset, tmp_path, evaluate=fails)
+        assert type(raised.value) is kind
+        assert raised.value.__cause__ is error
+        assert updates_in(tmp_path / ZIP) == 2
+
     def test_the_checkpoint_that_is_due_comes_before_the_evaluation(
         self, dataset: EpisodeDataset, tmp_path: Path
     ) -> None:
@@ -301,21 +315,21 @@ class TestLooking:
         assert updates_in(file) == 4
 
     def test_too_few_landmarks_are_named_before_training(self) -> None:
-        with pytest.raises(ValueError, match="2 evaluation episodes, but reacher has 0 landmarks"):
+        with pytest.raises(SettingsError, match="eval_episodes=2, but reacher has 0 landmark goals"):
             LandmarkEvaluation(fresh(), episodes=2, episode_steps=3)
 
     def test_no_ffmpeg_is_named_before_training(
         self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-        with pytest.raises(ModuleNotFoundError, match=r"torchrl-ocwm\[recipes\]'.*video_interval=0"):
+        with pytest.raises(MissingPackageError, match=r"torchrl-ocwm\[recipes\]'.*video_interval=0"):
             OpenLoopFilm(fresh(), dataset, tmp_path)
 
     def test_no_tqdm_is_named_before_training(
         self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(hooks, "find_spec", lambda name: None)
-        with pytest.raises(ModuleNotFoundError, match=r"needs tqdm: pip install 'torchrl-ocwm\[recipes\]'"):
+        with pytest.raises(MissingPackageError, match=r"needs tqdm: pip install 'torchrl-ocwm\[recipes\]'"):
             train_offline(fresh(), dataset, tmp_path / "run", SHORT)
         assert not (tmp_path / "run").exists()
         train(fresh(), dataset, tmp_path / "run", replace(SHORT, updates=2))

@@ -57,7 +57,7 @@ def load_agent(path: str | Path, *, device: torch.device | str = "cpu") -> Polic
 
     Raises:
         CheckpointError: if there is no checkpoint, a damaged one, or not one of an agent of this library.
-        ValueError: if there is no such device.
+        DeviceError: if there is no such device.
     """
     path, device = Path(path), usable_device(device)
     agent = rebuild(read_description(path))

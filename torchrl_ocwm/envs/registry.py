@@ -102,8 +102,8 @@ def make_env(
         given at reset: ``env.reset(TensorDict({"goal_position": goals}, env.batch_size))``.
 
     Raises:
-        ValueError: for an unknown name.
-        ModuleNotFoundError: if the simulator is missing, with the extra to install.
+        SettingsError: for an unknown name.
+        MissingPackageError: if the simulator is missing, with the extra to install.
 
     Examples:
         >>> env = make_env("reacher", horizon=50, seed=0)
@@ -150,7 +150,7 @@ def _find(name: str) -> Environment:
     by_id = {environment.id: environment for environment in ENVIRONMENTS.values()}
     environment = ENVIRONMENTS.get(name) or by_id.get(name)
     if environment is None:
-        raise ValueError(f"unknown environment {name!r}; there are {', '.join(ENVIRONMENTS)}")
+        raise SettingsError(f"unknown environment {name!r}; there are {', '.join(ENVIRONMENTS)}")
     for module in ("gymnasium", "mujoco", environment.module):
         if find_spec(module) is None:
             raise missing(f"environment {name!r}", module, environment.extra)

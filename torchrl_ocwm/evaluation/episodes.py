@@ -7,21 +7,23 @@ from contextlib import closing
 from functools import partial
 from typing import Any
 
-import gymnasium
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
-from tqdm import tqdm
 
 from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
 from torchrl_ocwm.envs import ENVIRONMENTS, Task, make_env
+from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.evaluation.randomness import EpisodeRandomness
 from torchrl_ocwm.evaluation.scores import normalized_score
 from torchrl_ocwm.processes import Worker, make_worker
+
+with needs("an evaluation", "recipes"):
+    from tqdm import tqdm
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 _KEPT = ("object_position", "object_position_true", "reward")
@@ -217,6 +219,8 @@ def goal_images(task: Task, goals: Tensor) -> Tensor:
     Returns:
         ``[N, 3, H, W]`` uint8.
     """
+    import gymnasium
+
     with closing(gymnasium.make(ENVIRONMENTS[task.name].id, **task.options)) as env:
         env.reset(seed=0)
         scene: Any = env.unwrapped

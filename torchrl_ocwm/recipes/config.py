@@ -20,7 +20,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl_ocwm.agents import AGENTS, SIZES
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.errors import UserError
-from torchrl_ocwm.files import replacing
+from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.parts import load_plugins
 from torchrl_ocwm.settings import field_docs, from_dict, to_dict
 
@@ -48,11 +48,11 @@ def recipe(
 
         def guarded(config: DictConfig) -> None:
             try:
-                function(from_dict(kind, OmegaConf.to_container(config, resolve=True, throw_on_missing=True)))
+                function(from_dict(kind, _given(config)))
             except (UserError, CheckpointError, OmegaConfBaseException) as error:
                 if os.environ.get("HYDRA_FULL_ERROR") == "1":
                     raise
-                sys.exit(f"{type(error).__name__}: {error}")
+                sys.exit(" ".join(f"{type(error).__name__}: {error}".split()))
 
         def main() -> None:
             store_options()
@@ -76,9 +76,12 @@ def store_options() -> None:
 
 
 def keep_settings(settings: Any, folder: Path) -> None:
-    """Keep the settings of a run in its folder, as ``config.yaml``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / "config.yaml") as new:
+    """Keep the settings of a run in its folder, as ``config.yaml``.
+
+    Raises:
+        OutputError: if it cannot be written.
+    """
+    with writing(folder / "config.yaml") as new:
         OmegaConf.save(OmegaConf.create(to_dict(settings)), new)
 
 
@@ -118,6 +121,12 @@ def _schema(kind: type, groups: Mapping[str, str], more: Mapping[str, Any]) -> d
     text = "\n".join(help_lines(kind)).replace("$", "")
     own = {"run": {"dir": "."}, "output_subdir": None, "help": {"header": f"Settings:\n{text}\n"}, **more}
     return {"defaults": [*defaults, "_self_", *quiet], **plain, "hydra": own}
+
+
+def _given(config: DictConfig) -> dict[str, Any]:
+    """The settings that have a value."""
+    values: Any = OmegaConf.to_container(config, resolve=True)
+    return {name: value for name, value in values.items() if value != "???"}
 
 
 def _default(one: Any) -> Any:

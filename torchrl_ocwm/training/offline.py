@@ -20,6 +20,7 @@ from torchrl_ocwm.agents.archive import Archive, recover
 from torchrl_ocwm.agents.checkpoint import check_same_agent, describe
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals, make_replay_buffer
 from torchrl_ocwm.devices import usable_device
+from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.files import only_writer
 from torchrl_ocwm.training.hooks import Every, LossLog, ProgressBar, RunTrainer, StopOnSignals, UpdateClock
 from torchrl_ocwm.training.loggers import make_loggers
@@ -34,8 +35,8 @@ Evaluate = Callable[[int], dict[str, float]]
 Film = Callable[[int], Path]
 
 
-class EvaluationError(RuntimeError):
-    """An evaluation during training failed; the message says that nothing is lost."""
+class EvaluationError(UserError, RuntimeError):
+    """An evaluation during training failed, for a reason that the user can mend; nothing is lost."""
 
 
 def train_offline(
@@ -75,11 +76,12 @@ def train_offline(
         CheckpointError: if the folder's checkpoint is damaged, of another agent, or was trained with something else, or
             a checkpoint cannot be written.
         FolderInUseError: if another process trains in the folder.
-        FloatingPointError: if a loss is not finite.
-        EvaluationError: if ``evaluate`` fails; the checkpoint of that update is written.
+        DivergedError: if a loss is not finite.
+        EvaluationError: if ``evaluate`` fails for a reason that the user can mend. The checkpoint of that update is
+            written, whatever it fails for.
         LogError: if the log cannot be written.
-        ValueError: if there is no such device.
-        ModuleNotFoundError: if the package of a logger or of the progress bar is missing.
+        DeviceError: if there is no such device.
+        MissingPackageError: if the package of a logger or of the progress bar is missing.
     """
     folder = Path(folder)
     training = replace(training, device=str(usable_device(training.device)))
@@ -153,10 +155,13 @@ class _Run:
             return evaluate(updates)
         except Exception as error:
             self._save(updates)
-            raise EvaluationError(
+            message = (
                 f"the evaluation after {updates} updates failed ({type(error).__name__}: {error}); the checkpoint of "
-                "this update is kept: run the same command again to go on, with eval_interval=0 if need be"
-            ) from error
+                "this update is kept: run the same command again to go on, with training.eval_interval=0 if need be"
+            )
+            if isinstance(error, (UserError, OSError)):  # what the machine or the settings lack
+                raise EvaluationError(message) from error
+            raise RuntimeError(message) from error
 
     def _film(self, film: Film, updates: int) -> None:
         try:
