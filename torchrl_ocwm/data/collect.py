@@ -71,13 +71,14 @@ MAX_FAILURES = 3
 def collect(
     path: str | Path,
     environment: str,
-    settings: Collection,
+    settings: Collection | int,
     *,
     policy: TensorDictModuleBase | None = None,
     options: dict[str, Any] | None = None,
     progress: bool = True,
+    **more: Any,
 ) -> EpisodeDataset:
-    """Collect whole episodes into a dataset until it holds at least ``settings.steps`` environment steps.
+    """Collect whole episodes into a dataset until it holds at least so many environment steps.
 
     A folder that holds a dataset already is continued, with other random numbers and, if you like, with another
     policy; when it has enough, nothing is collected. The process may be killed at any moment: the folder then holds
@@ -95,10 +96,11 @@ def collect(
     Args:
         path: Folder of the dataset.
         environment: Name of the environment (:data:`~torchrl_ocwm.envs.ENVIRONMENTS`).
-        settings: How much, by whom and how.
+        settings: How much, by whom and how; or the steps, with other settings as arguments.
         policy: A module that writes ``action``, in place of ``settings.policy``.
         options: Passed to the environment.
         progress: Show a progress bar with the rate.
+        more: Fields of :class:`~torchrl_ocwm.data.settings.Collection`, where ``settings`` is a number of steps.
 
     Returns:
         The dataset, opened.
@@ -111,6 +113,8 @@ def collect(
         CollectionError: if one episode after the other fails, in the simulator or with its process. What fails
             otherwise is raised as a ``RuntimeError``.
     """
+    if isinstance(settings, int):
+        settings = Collection(steps=settings, **more)
     options = options or {}
     task = make_task(environment, **options)
     source = {"environment": environment, "options": options, "task": task.to_dict()}
