@@ -67,6 +67,12 @@ class Evaluate(Evaluation):
     include: tuple[str, ...] = ()
     output: str = "outputs/evaluation"
 
+    def validate(self) -> None:
+        """There is something to evaluate."""
+        super().validate()
+        if not self.checkpoint:
+            raise SettingsError(f"checkpoint must name a file or several, got {self.checkpoint!r}")
+
 
 @recipe("evaluate")
 @ended_by_signals()

@@ -32,4 +32,4 @@ class Collection(Settings):
     policy: str = "random"
     workers: int = setting(2, at_least=0, at_most=1024)
     seed: int = setting(0, at_least=0, at_most=2**32 - 1)
-    timeout: float = setting(120.0, above=0)
+    timeout: float = setting(120.0, above=0, at_most=10**6)
