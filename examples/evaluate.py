@@ -41,6 +41,7 @@ from torchrl_ocwm.evaluation.settings import Evaluation
 from torchrl_ocwm.evaluation.videos import decode_video, mark, tile, write_video
 from torchrl_ocwm.modules import ObjectWorldModel
 from torchrl_ocwm.recipes import recipe
+from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.signals import ended_by_signals
 from torchrl_ocwm.training.offline import CHECKPOINT
 
@@ -68,6 +69,12 @@ class Evaluate(Evaluation):
     checkpoint: str | tuple[str, ...]
     include: tuple[str, ...] = ()
     output: str = "outputs/evaluation"
+
+    def validate(self) -> None:
+        """There is something to evaluate."""
+        super().validate()
+        if not self.checkpoint:
+            raise SettingsError(f"checkpoint must name a file or several, got {self.checkpoint!r}")
 
 
 @recipe("evaluate")
@@ -131,14 +138,14 @@ def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dic
     """What a report keeps of each checkpoint: where it is, what is in it, and of what kind its agent is.
 
     Raises:
-        ValueError: for one that would count twice.
+        SettingsError: for one that would count twice.
     """
     seen = {run: source for row in report.rows.values() for run, source in zip(row.runs, row.sources, strict=True)}
     runs = []
     for file, policy in zip(files, policies, strict=True):
         run = sha256(file.read_bytes()).hexdigest()
         if run in seen:
-            raise ValueError(f"{file}: the same run as {seen[run]}, which counts already; leave one of them out")
+            raise SettingsError(f"{file}: the same run as {seen[run]}, which counts already; leave one of them out")
         seen[run] = str(file)
         kind = sha256(json.dumps(describe(policy.agent), sort_keys=True).encode()).hexdigest()
         runs.append({"source": str(file), "run": run, "kind": kind})
@@ -160,7 +167,7 @@ def _one_task(policies: list[Policy], files: list[Path]) -> Task:
     for (task, index), file in zip(tasks, files, strict=True):
         if (task, index) != tasks[0]:
             this, first = (f"the {one.objects[number]!r} of {one}" for one, number in ((task, index), tasks[0]))
-            raise ValueError(f"{file} is about {this}, {files[0]} about {first}; evaluate them one after the other")
+            raise SettingsError(f"{file} is about {this}, {files[0]} about {first}; evaluate them one after the other")
     return tasks[0][0]
 
 

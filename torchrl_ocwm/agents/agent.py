@@ -77,7 +77,7 @@ class Agent(nn.Module):
             (:class:`~torchrl_ocwm.data.RelabelGoals`).
 
     Raises:
-        ValueError: if the choices do not fit together or an image of the task cannot be halved by the CNN.
+        SettingsError: if the choices do not fit together or an image of the task cannot be halved by the CNN.
     """
 
     def __init__(self, task: Task, config: AgentConfig, size: Size) -> None:
@@ -95,11 +95,11 @@ class Agent(nn.Module):
         """A behaviour by its name; without one, that which acts.
 
         Raises:
-            ValueError: for an unknown name, with those that there are.
+            SettingsError: for an unknown name, with those that there are.
         """
         name = name or self.config.acting
         if name not in self.behaviours:
-            raise ValueError(f"unknown behaviour {name!r}; this agent has {', '.join(self.behaviours)}")
+            raise SettingsError(f"unknown behaviour {name!r}; this agent has {', '.join(self.behaviours)}")
         found = self.behaviours[name]
         assert isinstance(found, LearntBehaviour)
         return found

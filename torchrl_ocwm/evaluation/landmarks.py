@@ -6,6 +6,7 @@ import torch
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, goal_images, measure
+from torchrl_ocwm.settings import SettingsError
 
 
 class LandmarkEvaluation:
@@ -22,13 +23,13 @@ class LandmarkEvaluation:
         episode_steps: Steps of each.
 
     Raises:
-        ValueError: if there are more episodes than landmarks.
+        SettingsError: if there are more episodes than landmarks.
     """
 
     def __init__(self, agent: Agent, *, episodes: int, episode_steps: int) -> None:
         landmarks = agent.task.workspace.landmarks
         if episodes > len(landmarks):
-            raise ValueError(f"{episodes} evaluation episodes, but {agent.task.name} has {len(landmarks)} landmarks")
+            raise SettingsError(f"eval_episodes={episodes}, but {agent.task.name} has {len(landmarks)} landmark goals")
         self.policy, self.goals = agent.policy(), torch.tensor(landmarks[:episodes])
         self.images = (
             None

@@ -42,7 +42,7 @@ class Evaluation(Settings):
     envs: int = setting(10, at_least=1, at_most=10**4)
     video_goals: int = setting(6, at_least=0)
     seed: int = setting(0, at_least=0, at_most=2**32 - 1)
-    timeout: float = setting(120.0, above=0)
+    timeout: float = setting(120.0, above=0, at_most=10**6)
 
     def validate(self) -> None:
         """A square grid."""

@@ -17,6 +17,7 @@ from torchrl_ocwm.modules.latent import FullLatent, InitialLatent, LatentOfImage
 from torchrl_ocwm.modules.networks import make_image_decoder, make_mlp, make_rssm
 from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.units import WorkspaceUnits
+from torchrl_ocwm.settings import SettingsError
 
 VectorName = Literal["proprio", "object_position", "goal_position"]
 _KEYS: dict[str, str] = {"proprio": "proprio", "object_position": "object_units", "goal_position": "goal_units"}
@@ -259,10 +260,12 @@ class FlatWorldModel(WorldModel):
         """Decoded object positions ``object_units`` ``[..., O * D]``, in workspace units.
 
         Raises:
-            ValueError: if the model does not decode them.
+            SettingsError: if the model does not decode them.
         """
         if "object_position" not in self.vector_decoders:
-            raise ValueError("this world model does not decode object positions; add 'object_position' to `observed`")
+            raise SettingsError(
+                "this world model does not decode object positions; add 'object_position' to `observed`"
+            )
         return TensorDictModule(self.vector_decoders["object_position"], latent_at(("latent",)), ["object_units"])
 
 
