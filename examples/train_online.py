@@ -53,7 +53,7 @@ class TrainOnline(Settings):
     dataset: str | None = None
 
 
-@recipe("train_online", {"agent": "focus_lcp", "env": "reacher", "size": "cpu"})
+@recipe("train_online", {"agent": "focus_lcp", "explore": "none", "env": "reacher", "size": "cpu"})
 def main(config: TrainOnline) -> None:
     training, folder = config.training, run_folder(config.output)
     name, options = config.env.name, dict(config.env.options)
