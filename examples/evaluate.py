@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
-import gymnasium
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -21,7 +22,7 @@ from torchrl_ocwm import load_agent
 from torchrl_ocwm.agents import Agent, Policy, agent_name
 from torchrl_ocwm.agents.checkpoint import describe
 from torchrl_ocwm.data import SmoothRandomPolicy
-from torchrl_ocwm.envs import ENVIRONMENTS, Task
+from torchrl_ocwm.envs import Task, find_environment, make_scene
 from torchrl_ocwm.evaluation import (
     EvaluationEnvs,
     ReconstructionError,
@@ -40,6 +41,7 @@ from torchrl_ocwm.evaluation.settings import Evaluation
 from torchrl_ocwm.evaluation.videos import decode_video, mark, tile, write_video
 from torchrl_ocwm.modules import ObjectWorldModel
 from torchrl_ocwm.recipes import recipe
+from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.signals import ended_by_signals
 from torchrl_ocwm.training.offline import CHECKPOINT
 
@@ -68,19 +70,25 @@ class Evaluate(Evaluation):
     include: tuple[str, ...] = ()
     output: str = "outputs/evaluation"
 
+    def validate(self) -> None:
+        """There is something to evaluate."""
+        super().validate()
+        if not self.checkpoint:
+            raise SettingsError(f"checkpoint must name a file or several, got {self.checkpoint!r}")
+
 
 @recipe("evaluate")
 @ended_by_signals()
 def main(config: Evaluate) -> None:
     settings = config
     files = [Path(one) for one in ([config.checkpoint] if isinstance(config.checkpoint, str) else config.checkpoint)]
-    policies = [load_agent(file) for file in files]
-    task, output = _one_task(policies, files), Path(config.output)
+    policies = [load_agent(file, behaviour=settings.behaviour) for file in files]
+    task, about, output = _one_task(policies, files), policies[0].object_index, Path(config.output)
     goals = task.workspace.grid(settings.grid_size).flatten(0, 1)
     images = None
     if settings.image_goals or not all(policy.takes_positions for policy in policies):
-        images = goal_images(task, goals)
-    report = _report(goals, settings, config.include)
+        images = goal_images(task, goals, object_index=about)
+    report = _report(goals, settings, config.include, {"object": task.objects[about]} if about else {})
     runs = _runs(files, policies, report)
     with EvaluationEnvs(
         task,
@@ -91,11 +99,12 @@ def main(config: Evaluate) -> None:
     ) as envs:
         if settings.random and "random" not in report.rows:
             played = envs.run(SmoothRandomPolicy(task.action), goals, seed=settings.seed, progress=True)
-            report.add("random", measure(played), source="smooth actions")
+            report.add("random", measure(played, object_index=about), source="smooth actions")
         for policy, run in zip(policies, runs, strict=True):
+            name = agent_name(policy.agent.config) + (f", {settings.behaviour}" if settings.behaviour else "")
             for kind in _goal_kinds(policy, settings.image_goals):
                 scores = _evaluate(policy, envs, goals, settings.seed, images if kind == IMAGE_GOALS else None)
-                report.add(agent_name(policy.agent.config) + kind, scores, **run)
+                report.add(name + kind, scores, **run)
         report.save(output)
         print(report.markdown())
         _draw(report, task, output)
@@ -116,9 +125,9 @@ def _goal_kinds(policy: Policy, image_goals: bool) -> list[str]:
     return positions + [IMAGE_GOALS] * (policy.takes_images and (image_goals or not positions))
 
 
-def _report(goals: Tensor, settings: Evaluation, include: Sequence[str]) -> Report:
+def _report(goals: Tensor, settings: Evaluation, include: Sequence[str], more: dict[str, Any]) -> Report:
     """An empty report, or one with the rows of earlier ones."""
-    kept = {"goals": settings.goals, "episode_steps": settings.episode_steps, "seed": settings.seed}
+    kept = {"goals": settings.goals, "episode_steps": settings.episode_steps, "seed": settings.seed, **more}
     report = Report(goals, {**kept, "starts": "by goal"})  # earlier releases: by place among the environments
     for file in include:
         report.include(Report.load(file))
@@ -129,14 +138,14 @@ def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dic
     """What a report keeps of each checkpoint: where it is, what is in it, and of what kind its agent is.
 
     Raises:
-        ValueError: for one that would count twice.
+        SettingsError: for one that would count twice.
     """
     seen = {run: source for row in report.rows.values() for run, source in zip(row.runs, row.sources, strict=True)}
     runs = []
     for file, policy in zip(files, policies, strict=True):
         run = sha256(file.read_bytes()).hexdigest()
         if run in seen:
-            raise ValueError(f"{file}: the same run as {seen[run]}, which counts already; leave one of them out")
+            raise SettingsError(f"{file}: the same run as {seen[run]}, which counts already; leave one of them out")
         seen[run] = str(file)
         kind = sha256(json.dumps(describe(policy.agent), sort_keys=True).encode()).hexdigest()
         runs.append({"source": str(file), "run": run, "kind": kind})
@@ -153,11 +162,13 @@ def _draw(report: Report, task: Task, output: Path) -> None:
 
 
 def _one_task(policies: list[Policy], files: list[Path]) -> Task:
-    tasks = [policy.agent.task for policy in policies]
-    for task, file in zip(tasks, files, strict=True):
-        if task != tasks[0]:
-            raise ValueError(f"{file} is of {task}, {files[0]} of {tasks[0]}; evaluate them one after the other")
-    return tasks[0]
+    """The task of all of them; scores of different objects are not to be compared either."""
+    tasks = [(policy.agent.task, policy.object_index) for policy in policies]
+    for (task, index), file in zip(tasks, files, strict=True):
+        if (task, index) != tasks[0]:
+            this, first = (f"the {one.objects[number]!r} of {one}" for one, number in ((task, index), tasks[0]))
+            raise SettingsError(f"{file} is about {this}, {files[0]} about {first}; evaluate them one after the other")
+    return tasks[0][0]
 
 
 def _folders(sources: list[str]) -> list[Path]:
@@ -168,7 +179,7 @@ def _folders(sources: list[str]) -> list[Path]:
 def _evaluate(
     policy: Policy, envs: EvaluationEnvs, goals: Tensor, seed: int, images: Tensor | None = None
 ) -> dict[str, Tensor]:
-    reconstruct = ReconstructionError(policy.agent)
+    reconstruct = ReconstructionError(policy.agent, object_index=policy.object_index)
 
     def inspect(step: TensorDictBase) -> dict[str, Tensor | TensorDictBase]:
         return {**reconstruct(step), "latent": step["latent"].select("state", "belief", "goal", strict=False)}
@@ -177,9 +188,14 @@ def _evaluate(
     errors = {name: episodes[name].mean(1) for name in ("entity_error", "goal_error") if name in episodes}
     if "object_position" in policy.agent.model.observed:
         errors["imagined_distance"] = imagined_distance(
-            policy.agent, episodes["latent"][:, 0], goals, envs.episode_steps, seed=seed
+            policy.behaviour,
+            episodes["latent"][:, 0],
+            goals,
+            envs.episode_steps,
+            object_index=policy.object_index,
+            seed=seed,
         )
-    return {**measure(episodes), **errors}
+    return {**measure(episodes, object_index=policy.object_index), **errors}
 
 
 def _film(
@@ -203,10 +219,10 @@ def _film(
         return {"latent": step["latent"], **transition(step)}
 
     episodes = envs.run(policy, goals, images=images, seed=seed, numbers=chosen, inspect=inspect)
-    latents = imagined_rollout(policy.agent, episodes["latent"][:, 0], envs.episode_steps, seed=seed)["latent"]
+    latents = imagined_rollout(policy.behaviour, episodes["latent"][:, 0], envs.episode_steps, seed=seed)["latent"]
     imagined = decode_video(policy.agent.model, latents)
-    with gymnasium.make(ENVIRONMENTS[task.name].id, **task.options) as env:
-        points = torch.as_tensor(env.unwrapped.project(goals.numpy()))
+    with closing(make_scene(find_environment(task.name), **task.options)) as scene:
+        points = torch.as_tensor(scene.project(goals.numpy()))
     rows = [mark(episodes["transition", "next", "pixels"], points), mark(imagined, points)]
     if images is not None:
         rows.insert(0, images.unsqueeze(1).expand_as(rows[0]))

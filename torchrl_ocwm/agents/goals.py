@@ -68,7 +68,7 @@ class NoGoal(Goal):
 @register("position")
 @dataclass(frozen=True)
 class Position(Goal):
-    """They also see the goal position, in workspace units (paper, section PCP)."""
+    """Actor and critic also see the goal position, in workspace units (paper, section PCP)."""
 
     def build(self, scene: Scene) -> GoalEncoding:
         """The position as it is."""
@@ -81,7 +81,7 @@ class Position(Goal):
 @register("object_latent")
 @dataclass(frozen=True)
 class ObjectLatent(Goal):
-    """They also see the latent that the object would have at the goal (paper, section LCP).
+    """Actor and critic also see the latent that the object would have at the goal (paper, section LCP).
 
     Positions and images are encoded by different networks, which are trained to agree in direction only. All goals are
     brought to one length here, so that an actor trained on the one kind knows the other. With ``distance="mse"``

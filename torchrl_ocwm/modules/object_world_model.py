@@ -12,6 +12,7 @@ from torchrl_ocwm.modules.latent import LatentsInEmbedding, LatentsInImages
 from torchrl_ocwm.modules.networks import make_mlp
 from torchrl_ocwm.modules.objects import LatentPositionalEncoder, ObjectDecoder, ObjectLatentExtractor, compose
 from torchrl_ocwm.modules.world_model import VectorName, WorldModel, key_at, latent_at
+from torchrl_ocwm.settings import SettingsError
 
 
 class ObjectWorldModel(WorldModel):
@@ -29,7 +30,7 @@ class ObjectWorldModel(WorldModel):
         kwargs: The other arguments of :class:`~torchrl_ocwm.modules.WorldModel`.
 
     Raises:
-        ValueError: if the object positions are not observed.
+        SettingsError: if the object positions are not observed.
 
     Examples:
         >>> from torchrl_ocwm.testing import random_records, reacher_task
@@ -51,7 +52,7 @@ class ObjectWorldModel(WorldModel):
         **kwargs: Any,
     ) -> None:
         if "object_position" not in observed:
-            raise ValueError(
+            raise SettingsError(
                 "an object-centric world model learns from object positions: 'object_position' in `observed`"
             )
         super().__init__(

@@ -9,9 +9,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import cosine_similarity, normalize
 
-from torchrl_ocwm.modules.choices import check_choice
 from torchrl_ocwm.modules.latent import FullLatent
 from torchrl_ocwm.modules.units import WorkspaceUnits
+from torchrl_ocwm.settings import read
 
 
 def position_distance(position: Tensor, goal: Tensor, epsilon: float = 1e-6) -> Tensor:
@@ -71,7 +71,7 @@ class LatentSimilarity(nn.Module):
 
     def __init__(self, object_index: int = 0, distance: LatentReward = "cosine") -> None:
         super().__init__()
-        check_choice("distance", distance, LatentReward)
+        read(LatentReward, distance, "distance")
         self.object_index, self.distance = object_index, distance
 
     def forward(self, object_latent: Tensor, goal: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from torchrl_ocwm.modules.latent import FullLatent, InitialLatent, LatentOfImage
 from torchrl_ocwm.modules.networks import make_image_decoder, make_mlp, make_rssm
 from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.units import WorkspaceUnits
+from torchrl_ocwm.settings import SettingsError
 
 VectorName = Literal["proprio", "object_position", "goal_position"]
 _KEYS: dict[str, str] = {"proprio": "proprio", "object_position": "object_units", "goal_position": "goal_units"}
@@ -97,7 +98,7 @@ class WorldModel(nn.Module, ABC):
         rollout.in_keys = [*rollout.in_keys, "is_init"]  # TorchRL's takes it as optional: then memory crosses episodes
         return TensorDictSequential(
             InitialLatent(self.state, self.belief),
-            TensorDictModule(_bounded, ["action"], ["bounded_action"]),
+            TensorDictModule(bounded, ["action"], ["bounded_action"]),
             *self._encode("next"),
             rollout,
             *self.decoders("next"),
@@ -149,7 +150,7 @@ class WorldModel(nn.Module, ABC):
         """Next state and belief, sampled from the prior. Actions beyond [−1, 1] count as clipped."""
         latent = latent_at(("latent",))
         return TensorDictSequential(
-            TensorDictModule(_bounded, ["action"], ["bounded_action"]),
+            TensorDictModule(bounded, ["action"], ["bounded_action"]),
             TensorDictModule(self.prior, [*latent, "bounded_action"], ["_", *latent]),
         )
 
@@ -259,10 +260,12 @@ class FlatWorldModel(WorldModel):
         """Decoded object positions ``object_units`` ``[..., O * D]``, in workspace units.
 
         Raises:
-            ValueError: if the model does not decode them.
+            SettingsError: if the model does not decode them.
         """
         if "object_position" not in self.vector_decoders:
-            raise ValueError("this world model does not decode object positions; add 'object_position' to `observed`")
+            raise SettingsError(
+                "this world model does not decode object positions; add 'object_position' to `observed`"
+            )
         return TensorDictModule(self.vector_decoders["object_position"], latent_at(("latent",)), ["object_units"])
 
 
@@ -277,7 +280,7 @@ class _ObjectUnits(nn.Module):
         return self.units(metres).flatten(-2)
 
 
-def _bounded(action: Tensor) -> Tensor:
+def bounded(action: Tensor) -> Tensor:
     """Clip to [−1, 1] and keep a gradient beyond, as TorchRL's block GRU does by itself."""
     action = action.float()
     return action / action.detach().abs().clamp_min(1)

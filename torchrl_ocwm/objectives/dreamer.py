@@ -102,7 +102,8 @@ class BehaviourLoss(LossModule):
         start = self.tensor_keys.is_init
         keys = [key if key == start else unravel_key(("next", key)) for key in after]
         if self.reward_loss is not None:
-            keys += [key[1:] for key in self.reward_loss.in_keys if isinstance(key, tuple) and key[0] == "records"]
+            read = [key for key in self.reward_loss.in_keys if isinstance(key, tuple) and key[0] == "records"]
+            keys += [unravel_key(key[1:]) for key in read]
         if self.replay_value_loss_weight:
             value = self.value_loss.tensor_keys
             keys += [unravel_key(("next", key)) for key in (value.reward, value.done, value.terminated)]

@@ -11,9 +11,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
-from torchrl_ocwm.modules.choices import check_choice
 from torchrl_ocwm.modules.dtypes import flags, unit_image
 from torchrl_ocwm.objectives.world_model import Term, WorldModelLoss
+from torchrl_ocwm.settings import read
 
 LatentDistance = Literal["cosine", "mse"]
 PositionalGradient = Literal["encoder", "latent", "both"]
@@ -100,8 +100,8 @@ def positional_latent_loss(
         >>> positional_latent_loss(latent, 2 * latent, torch.tensor([[True]]))
         tensor(-1.)
     """
-    check_choice("distance", distance, LatentDistance)
-    check_choice("gradient", gradient, PositionalGradient)
+    read(LatentDistance, distance, "distance")
+    read(PositionalGradient, gradient, "gradient")
     if gradient == "encoder":
         extracted = extracted.detach()
     elif gradient == "latent":
@@ -189,10 +189,12 @@ class FOCUSModelLoss(WorldModelLoss):
         for name, value in (("positional_distance", positional_distance), ("positional_gradient", positional_gradient)):
             if value is not None:
                 self._given[name] = "positional"
-        self.positional_distance: LatentDistance = positional_distance or "cosine"
-        self.positional_gradient: PositionalGradient = positional_gradient or "both"
-        check_choice("positional_distance", self.positional_distance, LatentDistance)
-        check_choice("positional_gradient", self.positional_gradient, PositionalGradient)
+        self.positional_distance: LatentDistance = read(
+            LatentDistance, positional_distance or "cosine", "positional_distance"
+        )
+        self.positional_gradient: PositionalGradient = read(
+            PositionalGradient, positional_gradient or "both", "positional_gradient"
+        )
 
     def terms(self) -> dict[str, Term]:
         """Masks and masked colours in place of the image, and what the two kinds of goals are encoded with."""
