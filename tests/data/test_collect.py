@@ -12,13 +12,16 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
-from torchrl_ocwm import build_agent
+from torchrl_ocwm import build_agent, save_agent
+from torchrl_ocwm.agents import AGENTS, EXPLORERS
 from torchrl_ocwm.agents.checkpoint import describe
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, ScriptedPolicy, SmoothRandomPolicy, object_coverage
-from torchrl_ocwm.data.collect import EpisodePlayer, collect
+from torchrl_ocwm.data.collect import CollectionError, EpisodePlayer, collect, make_policy
 from torchrl_ocwm.data.settings import Collection
-from torchrl_ocwm.envs import Reacher, Task, make_task
+from torchrl_ocwm.envs import Reacher, SimulationDivergedError, Task, make_task
+from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.processes import WorkerError
+from torchrl_ocwm.settings import SettingsError
 
 collect_module = sys.modules["torchrl_ocwm.data.collect"]
 OPTIONS = {"horizon": 20, "image_size": 32}
@@ -246,7 +249,7 @@ def test_checkpoint_as_policy(tmp_path):
 
 
 def test_unknown_policy(tmp_path, no_collector):
-    with pytest.raises(ValueError, match="unknown policy 'rnd'; there are random, scripted and checkpoint files"):
+    with pytest.raises(SettingsError, match="policy must be random, scripted or a checkpoint file, got 'rnd'"):
         gather(tmp_path / "data", 20, policy="rnd")
 
 
@@ -283,7 +286,11 @@ def test_simulator_that_fails_again_and_again(tmp_path, monkeypatch):
     monkeypatch.setattr(collect_module, "EpisodePlayer", BreaksAt)
     monkeypatch.setattr(BreaksAt, "numbers", range(100))
     message = "4 episodes failed in a row, the last one with: the simulation diverged"
-    with pytest.warns(RuntimeWarning), pytest.raises(RuntimeError, match=message):
+    with pytest.warns(RuntimeWarning), pytest.raises(RuntimeError, match=message) as raised:
+        gather(tmp_path / "data", 60)
+    assert not isinstance(raised.value, UserError)  # nobody knows what it is: it shows its traceback
+    monkeypatch.setattr(BreaksAt, "error", SimulationDivergedError("the simulation diverged"))
+    with pytest.warns(RuntimeWarning), pytest.raises(CollectionError, match=message):
         gather(tmp_path / "data", 60)
     assert not (tmp_path / "data").exists()
 
@@ -364,3 +371,20 @@ def test_foreign_index(tmp_path, no_collector):
     (tmp_path / "dataset.json").write_text('{"format": "another"}')
     with pytest.raises(DatasetError, match=r"dataset\.json: not an index of"):
         gather(tmp_path, 10)
+
+
+def test_which_behaviour_collects(tmp_path):
+    """And the index says which."""
+    task = make_task("reacher", **OPTIONS)
+    row = AGENTS["dreamer_pcp"].and_behaviours(explore=EXPLORERS["plan2explore"])
+    file = save_agent(build_agent(row, task, "debug"), tmp_path / "agent.zip")
+    for behaviour, name in (("explore", f"{file} (explore)"), (None, str(file))):
+        shown, policy = make_policy(file, task, behaviour)
+        assert shown == name
+        assert policy.behaviour is policy.agent.behaviours[behaviour or "reach"]
+    found = gather(tmp_path / "data", 20, policy=file, behaviour="explore")
+    assert found.metadata["policies"] == {f"{file} (explore)": 1}
+    with pytest.raises(ValueError, match="unknown behaviour 'play'; this agent has reach, explore"):
+        gather(tmp_path / "data", 40, policy=file, behaviour="play")
+    with pytest.raises(ValueError, match="behaviour does nothing: policy='random' has none; give it a checkpoint"):
+        Collection(behaviour="explore")

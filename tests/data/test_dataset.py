@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,8 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
-from torchrl_ocwm.files import FolderInUseError
+from torchrl_ocwm.data import dataset as dataset_module
+from torchrl_ocwm.files import FolderInUseError, only_writer
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 
@@ -367,6 +369,32 @@ def test_a_writer_that_dies_gives_the_dataset_back(filled):
     with EpisodeDataset.open(filled.path, write=True) as dataset:
         dataset.append(episode(4))
     assert_holds(EpisodeDataset.open(filled.path), [*THREE, episode(4)])
+
+
+def test_a_writer_sees_what_another_one_added_before_it(filled, monkeypatch):
+    """Another one may append between the first look at the index and the lock."""
+    filled.close()
+
+    @contextmanager
+    def after_another(folder):
+        monkeypatch.undo()
+        with EpisodeDataset.open(folder, write=True) as other:
+            other.append(episode(4))
+        with only_writer(folder):
+            yield
+
+    monkeypatch.setattr(dataset_module, "only_writer", after_another)
+    with EpisodeDataset.open(filled.path, write=True) as dataset:
+        dataset.append(episode(5))
+    assert_holds(EpisodeDataset.open(filled.path), [*THREE, episode(4), episode(5)])
+
+
+def test_metadata_changes_with_the_episode(filled):
+    filled.append(episode(4), note="four")
+    assert EpisodeDataset.open(filled.path).metadata["note"] == "four"
+    filled.annotate(note="more")
+    assert EpisodeDataset.open(filled.path).metadata["note"] == "more"
+    assert_holds(filled, [*THREE, episode(4)])
 
 
 def test_a_failed_opening_gives_the_dataset_back(filled):

@@ -29,7 +29,9 @@ from torchrl_ocwm.evaluation import (
     goal_images,
     transition,
 )
+from torchrl_ocwm.evaluation.episodes import SteppedEnvs
 from torchrl_ocwm.processes import WorkerError
+from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.testing import random_records, reacher_task
 
 
@@ -133,6 +135,24 @@ def test_process_that_dies_or_hangs_ends_the_evaluation(task: Task, number: sign
         with pytest.raises(WorkerError, match=message):
             envs.run(act, goals(task, 1))
     assert not multiprocessing.active_children()
+
+
+def test_closing_closes_every_environment() -> None:
+    closed = []
+
+    class Stub:
+        def reset(self) -> TensorDictBase:
+            return TensorDict({"observation": torch.zeros(1)})
+
+        def close(self) -> None:
+            closed.append(self)
+
+    envs = SteppedEnvs(Stub, lambda: None)  # type: ignore[arg-type]
+    assert envs.reset([{}, {}]).shape == (2,)
+    made = list(envs.envs)
+    envs.close()
+    assert len(closed) == 2
+    assert set(closed) == set(made)
 
 
 def test_evaluations_leave_no_descriptors(task: Task) -> None:
@@ -248,7 +268,7 @@ def test_landmarks(task: Task) -> None:
     assert set(scores) == {f"evaluation/{name}" for name in ("final_score", "mean_score", "success", "final_distance")}
     assert scores == again  # each time the same episodes
     assert 0 < scores["evaluation/final_score"] < 1
-    with pytest.raises(ValueError, match="11 evaluation episodes, but reacher has 10 landmarks"):
+    with pytest.raises(SettingsError, match="eval_episodes=11, but reacher has 10 landmark goals"):
         LandmarkEvaluation(agent, episodes=11, episode_steps=3)
 
 

@@ -46,11 +46,12 @@ def save_agent(agent: Agent, path: str | Path) -> Path:
     return Archive(agent=describe(agent), loss_module=agent.loss).save(path)
 
 
-def load_agent(path: str | Path, *, device: torch.device | str = "cpu") -> Policy:
+def load_agent(path: str | Path, *, behaviour: str | None = None, device: torch.device | str = "cpu") -> Policy:
     """Load a trained agent's policy from a checkpoint; no dataset and no simulator is needed.
 
     Args:
         path: A checkpoint that training or :func:`save_agent` wrote.
+        behaviour: Which of the agent's behaviours acts; ``None``: that which acts unless another is asked for.
         device: Where to put it.
 
     Returns:
@@ -59,13 +60,14 @@ def load_agent(path: str | Path, *, device: torch.device | str = "cpu") -> Polic
 
     Raises:
         CheckpointError: if there is no checkpoint, a damaged one, or not one of an agent of this library.
-        ValueError: if there is no such device.
+        DeviceError: if there is no such device.
+        ValueError: if there is no such behaviour.
     """
     path, device = Path(path), usable_device(device)
     agent = rebuild(read_description(path))
     Archive(loss_module=agent.loss).load(path, map_location="cpu")
     agent.to(device).eval().requires_grad_(False)
-    return agent.policy()
+    return agent.policy(behaviour)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from tqdm import tqdm
 
 from torchrl_ocwm.agents.checkpoint import load_agent
 from torchrl_ocwm.data.coverage import dataset_coverage
@@ -28,7 +27,18 @@ from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import ScriptedAction, Task, find_environment, make_env, make_task
+from torchrl_ocwm.envs.missing import needs
+from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.processes import Make, Worker, make_worker
+from torchrl_ocwm.settings import SettingsError
+
+with needs("a collection", "recipes"):
+    from tqdm import tqdm
+
+
+class CollectionError(UserError, RuntimeError):
+    """One episode after the other failed, in a simulator or in a process."""
+
 
 #: What a dataset keeps of an environment's observations.
 STORED = (
@@ -61,13 +71,14 @@ MAX_FAILURES = 3
 def collect(
     path: str | Path,
     environment: str,
-    settings: Collection,
+    settings: Collection | int,
     *,
     policy: TensorDictModuleBase | None = None,
     options: dict[str, Any] | None = None,
     progress: bool = True,
+    **more: Any,
 ) -> EpisodeDataset:
-    """Collect whole episodes into a dataset until it holds at least ``settings.steps`` environment steps.
+    """Collect whole episodes into a dataset until it holds at least so many environment steps.
 
     A folder that holds a dataset already is continued, with other random numbers and, if you like, with another
     policy; when it has enough, nothing is collected. The process may be killed at any moment: the folder then holds
@@ -85,29 +96,33 @@ def collect(
     Args:
         path: Folder of the dataset.
         environment: Name of the environment (:data:`~torchrl_ocwm.envs.ENVIRONMENTS`).
-        settings: How much, by whom and how.
+        settings: How much, by whom and how; or the steps, with other settings as arguments.
         policy: A module that writes ``action``, in place of ``settings.policy``.
         options: Passed to the environment.
         progress: Show a progress bar with the rate.
+        more: Fields of :class:`~torchrl_ocwm.data.settings.Collection`, where ``settings`` is a number of steps.
 
     Returns:
         The dataset, opened.
 
     Raises:
         DatasetError: if the folder holds a dataset of another environment or other options, or cannot be written.
-        ValueError: for an unknown policy, or a checkpoint of another task's agent.
+        SettingsError: for an unknown policy, or a checkpoint of another task's agent.
         CheckpointError: for a file that is no checkpoint of an agent.
         WorkerError: if a process ends before it has begun.
-        RuntimeError: if one episode after the other fails.
+        CollectionError: if one episode after the other fails, in the simulator or with its process. What fails
+            otherwise is raised as a ``RuntimeError``.
     """
+    if isinstance(settings, int):
+        settings = Collection(steps=settings, **more)
     options = options or {}
     task = make_task(environment, **options)
     source = {"environment": task.name, "options": options, "task": task.to_dict()}
-    name, module = make_policy(settings.policy if policy is None else policy, task)
+    name, module = make_policy(settings.policy if policy is None else policy, task, settings.behaviour)
     dataset = _open_if_there(Path(path), source)
     if dataset is not None and dataset.num_steps >= settings.steps:
         with dataset:
-            return _with_coverage(dataset, task)
+            return with_coverage(dataset, task)
     done = dataset.num_steps if dataset is not None else 0
 
     make_player = partial(
@@ -124,19 +139,21 @@ def collect(
         for records, failures in episodes:
             if dataset is None:
                 dataset = writing.enter_context(EpisodeDataset.create(path, example=records[0], metadata=source))
-            dataset.append(records, **_count(dataset, name, failures), coverage=None)
+            dataset.append(records, **count_episode(dataset, name, failures), coverage=None)
             bar.update(len(records) - 1)
             if dataset.num_steps >= settings.steps:
                 break
         assert dataset is not None
-        return _with_coverage(dataset, task)
+        return with_coverage(dataset, task)
 
 
-def make_policy(policy: str | Path | TensorDictModuleBase, task: Task) -> tuple[str, TensorDictModuleBase]:
-    """A policy's name in the index of a dataset, and the module that acts.
+def make_policy(
+    policy: str | Path | TensorDictModuleBase, task: Task, behaviour: str | None = None
+) -> tuple[str, TensorDictModuleBase]:
+    """A policy's name in the index of a dataset, and the module that acts: of an agent, one of its behaviours.
 
     Raises:
-        ValueError: for an unknown name, or a checkpoint of another task's agent.
+        SettingsError: for an unknown name, a checkpoint of another task's agent, or a behaviour that it does not have.
         CheckpointError: for a file that is no checkpoint of an agent.
     """
     if isinstance(policy, TensorDictModuleBase):
@@ -144,14 +161,14 @@ def make_policy(policy: str | Path | TensorDictModuleBase, task: Task) -> tuple[
     if policy in POLICIES:
         return str(policy), POLICIES[str(policy)](task.action)
     if not Path(policy).is_file():
-        raise ValueError(f"unknown policy {str(policy)!r}; there are {', '.join(POLICIES)} and checkpoint files")
-    loaded = load_agent(policy)
+        raise SettingsError(f"policy must be {', '.join(POLICIES)} or a checkpoint file, got {str(policy)!r}")
+    loaded = load_agent(policy, behaviour=behaviour)
     if loaded.agent.task != task:
-        raise ValueError(
-            f"{policy}: the agent was trained for {loaded.agent.task.name!r} with options "
+        raise SettingsError(
+            f"policy={policy}: the agent was trained for {loaded.agent.task.name!r} with options "
             f"{loaded.agent.task.options}, not for {task.name!r} with {task.options}"
         )
-    return str(policy), loaded
+    return f"{policy} ({behaviour})" if behaviour else str(policy), loaded
 
 
 class EpisodePlayer:
@@ -204,7 +221,8 @@ def play_in_order(
 
     Raises:
         WorkerError: if a process ends before it has begun.
-        RuntimeError: if one episode after the other fails.
+        CollectionError: if one episode after the other fails, in the simulator or with its process. What fails
+            otherwise is raised as a ``RuntimeError``.
     """
     begin = partial(make_worker, make_player, process=settings.workers > 0, timeout=settings.timeout)
     numbers, failures = count(first), 0
@@ -221,7 +239,7 @@ def play_in_order(
                 episode = players[turn].answer()
             except RuntimeError as error:  # of the simulator, or of a process that died or hangs
                 failures += 1
-                _check_failures(failures, error)
+                check_failures(failures, error)
                 players[turn].close()
                 players[turn] = begin()
                 players[turn].ready()
@@ -234,11 +252,13 @@ def play_in_order(
             player.close()
 
 
-def _check_failures(failures: int, error: RuntimeError) -> None:
+def check_failures(failures: int, error: RuntimeError) -> None:
+    """Warn of an episode that failed, or raise if too many did so in a row."""
     if isinstance(error, NotImplementedError):
         raise error
     if failures > MAX_FAILURES:
-        raise RuntimeError(f"{failures} episodes failed in a row, the last one with: {error}") from error
+        kind = CollectionError if isinstance(error, UserError) else RuntimeError
+        raise kind(f"{failures} episodes failed in a row, the last one with: {error}") from error
     warnings.warn(f"an episode failed ({error}) and is left out; a new process goes on", RuntimeWarning, stacklevel=2)
 
 
@@ -247,14 +267,15 @@ def _next_number(dataset: EpisodeDataset | None) -> int:
     return 0 if dataset is None else len(dataset.episode_lengths) + dataset.metadata.get("failures", 0)
 
 
-def _count(dataset: EpisodeDataset, policy: str, failures: int) -> dict[str, Any]:
+def count_episode(dataset: EpisodeDataset, policy: str, failures: int) -> dict[str, Any]:
     """The index's counts with one more episode."""
     counts = Counter(dataset.metadata.get("policies", {}))
     counts[policy] += 1
     return {"policies": dict(counts), "failures": dataset.metadata.get("failures", 0) + failures}
 
 
-def _with_coverage(dataset: EpisodeDataset, task: Task) -> EpisodeDataset:
+def with_coverage(dataset: EpisodeDataset, task: Task) -> EpisodeDataset:
+    """The dataset, which is open for writing, with the coverage of its episodes in its index."""
     if dataset.metadata.get("coverage") is None:
         coverage = dataset_coverage(dataset, task.objects, task.workspace)
         dataset.annotate(coverage={name: seen._asdict() for name, seen in coverage.items()})

@@ -16,6 +16,7 @@ from torchrl_ocwm.evaluation.open_loop import open_loop_latents, posterior
 from torchrl_ocwm.evaluation.plots import save_figure
 from torchrl_ocwm.evaluation.videos import grey, tile, to_uint8, write_video
 from torchrl_ocwm.modules import ObjectWorldModel
+from torchrl_ocwm.modules.dtypes import unit_image
 from torchrl_ocwm.objectives.focus import instance_masks
 
 _STYLES = {"filtered": "C0", "imagined": "C3", "unmoved": "0.5"}
@@ -44,7 +45,7 @@ def object_rows(
     """
     views = {
         "true": (
-            records["next", "pixels"].unsqueeze(-4).float() / 255,
+            unit_image(records["next", "pixels"]).unsqueeze(-4),
             instance_masks(records["next", "masks"]).float(),
         ),
         "filtered": decode_objects(model, posterior(model, records, "state", "belief")),
