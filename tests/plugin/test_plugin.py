@@ -21,6 +21,7 @@ from torchrl_ocwm.data import EpisodeDataset
 from torchrl_ocwm.data.collect import collect
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import EnvChoice, find_environment
+from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.evaluation import EvaluationEnvs
 from torchrl_ocwm.parts import VARIABLE, load_plugins
 from torchrl_ocwm.settings import SettingsError, change, to_dict
@@ -132,7 +133,7 @@ def test_a_fresh_process_loads_an_agent_of_such_parts(tmp_path: Path) -> None:
 def test_a_package_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "ocwm_example, ocwm_exmple")
     load_plugins.cache_clear()
-    with pytest.raises(SettingsError, match=f"{VARIABLE} names 'ocwm_exmple', which is not installed and not on"):
+    with pytest.raises(MissingPackageError, match=f"{VARIABLE} names 'ocwm_exmple', which is not installed and not on"):
         build_agent("no_such_row", reacher_task(), "debug")
 
 
