@@ -230,8 +230,9 @@ class Player:
     def _start(self) -> None:
         index = self.dataset.metadata
         name, options = index["environment"], index["options"]
-        make = partial(make_env, name, **{**options, "privileged": True})
-        chunk = options.get("horizon", getattr(find_environment(name).options(), "horizon", _CHUNK))
+        environment = find_environment(name)
+        make = partial(make_env, environment, **{**options, "privileged": True})
+        chunk = options.get("horizon", getattr(environment.options(), "horizon", _CHUNK))
         # Numbers of episodes that failed are not tried again: they may fail again.
         first = index.get(_NEXT, 0) + self._failures * max(self.online.workers, 1)
         self._collector = make_collector(make, self._acting, self.online, first=first, chunk=chunk)
