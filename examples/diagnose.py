@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchrl_ocwm import load_agent
 from torchrl_ocwm.agents import Agent
-from torchrl_ocwm.data import EpisodeDataset
+from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
 from torchrl_ocwm.evaluation.object_pictures import draw_errors, draw_goal_latents, picture_objects
@@ -77,7 +77,7 @@ def _records(path: Path, checkpoint: str, task: Task, settings: Diagnosis) -> Te
     dataset = EpisodeDataset.open(path)
     there = dataset.task
     if there != task:
-        raise ValueError(f"{dataset.path}: holds {there}, but the agent in {checkpoint} is of {task}")
+        raise DatasetError(f"{dataset.path}: holds {there}, but the agent in {checkpoint} is of {task}")
     records = random_sequences(dataset, settings.sequences, settings.length, seed=settings.seed)
     return records.to(settings.device)
 

@@ -41,11 +41,13 @@ from torchrl_ocwm.evaluation.settings import Evaluation
 from torchrl_ocwm.evaluation.videos import decode_video, mark, tile, write_video
 from torchrl_ocwm.modules import ObjectWorldModel
 from torchrl_ocwm.recipes import recipe
+from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.signals import ended_by_signals
 from torchrl_ocwm.training.offline import CHECKPOINT
 
 CONTEXT = 5  # frames that are seen before the objects are imagined
-IMAGE_GOALS = ", image goals"
+IMAGE_GOALS = ", image goals"  # after the name of a row; without it goals are positions
+FILMS = {"": "episodes.mp4", IMAGE_GOALS: "episodes_image_goals.mp4"}
 CURVES = {
     "evaluation/final_score": "final score, landmark goals",
     "return_high": "imagined return, 95th percentile",
@@ -68,6 +70,12 @@ class Evaluate(Evaluation):
     include: tuple[str, ...] = ()
     output: str = "outputs/evaluation"
 
+    def validate(self) -> None:
+        """There is something to evaluate."""
+        super().validate()
+        if not self.checkpoint:
+            raise SettingsError(f"checkpoint must name a file or several, got {self.checkpoint!r}")
+
 
 @recipe("evaluate")
 @ended_by_signals()
@@ -77,7 +85,9 @@ def main(config: Evaluate) -> None:
     policies = [load_agent(file, behaviour=settings.behaviour) for file in files]
     task, about, output = _one_task(policies, files), policies[0].object_index, Path(config.output)
     goals = task.workspace.grid(settings.grid_size).flatten(0, 1)
-    images = goal_images(task, goals, object_index=about) if settings.image_goals else None
+    images = None
+    if settings.image_goals or not all(policy.takes_positions for policy in policies):
+        images = goal_images(task, goals, object_index=about)
     report = _report(goals, settings, config.include, {"object": task.objects[about]} if about else {})
     runs = _runs(files, policies, report)
     with EvaluationEnvs(
@@ -92,19 +102,27 @@ def main(config: Evaluate) -> None:
             report.add("random", measure(played, object_index=about), source="smooth actions")
         for policy, run in zip(policies, runs, strict=True):
             name = agent_name(policy.agent.config) + (f", {settings.behaviour}" if settings.behaviour else "")
-            report.add(name, _evaluate(policy, envs, goals, settings.seed), **run)
-            if images is not None and policy.takes_images:
-                report.add(name + IMAGE_GOALS, _evaluate(policy, envs, goals, settings.seed, images), **run)
+            for kind in _goal_kinds(policy, settings.image_goals):
+                scores = _evaluate(policy, envs, goals, settings.seed, images if kind == IMAGE_GOALS else None)
+                report.add(name + kind, scores, **run)
         report.save(output)
         print(report.markdown())
         _draw(report, task, output)
         if settings.video_goals:
             chosen = torch.linspace(0, len(goals) - 1, min(settings.video_goals, settings.goals)).round().long()
             film = partial(_film, policies[-1], envs, goals, chosen, settings.seed)
-            _picture_objects(policies[-1].agent, film(output / "episodes.mp4"), output)
-            if images is not None and policies[-1].takes_images:
-                film(output / "episodes_image_goals.mp4", images)
+            films = [
+                film(output / FILMS[kind], images if kind == IMAGE_GOALS else None)
+                for kind in _goal_kinds(policies[-1], settings.image_goals)
+            ]
+            _picture_objects(policies[-1].agent, films[0], output)
     print(f"\ntable, numbers, heatmap, learning curve, videos: {output}")
+
+
+def _goal_kinds(policy: Policy, image_goals: bool) -> list[str]:
+    """What goals a policy is evaluated with, by the end of its row's name: images too, or if it takes nothing else."""
+    positions = [""] if policy.takes_positions else []
+    return positions + [IMAGE_GOALS] * (policy.takes_images and (image_goals or not positions))
 
 
 def _report(goals: Tensor, settings: Evaluation, include: Sequence[str], more: dict[str, Any]) -> Report:
@@ -120,14 +138,14 @@ def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dic
     """What a report keeps of each checkpoint: where it is, what is in it, and of what kind its agent is.
 
     Raises:
-        ValueError: for one that would count twice.
+        SettingsError: for one that would count twice.
     """
     seen = {run: source for row in report.rows.values() for run, source in zip(row.runs, row.sources, strict=True)}
     runs = []
     for file, policy in zip(files, policies, strict=True):
         run = sha256(file.read_bytes()).hexdigest()
         if run in seen:
-            raise ValueError(f"{file}: the same run as {seen[run]}, which counts already; leave one of them out")
+            raise SettingsError(f"{file}: the same run as {seen[run]}, which counts already; leave one of them out")
         seen[run] = str(file)
         kind = sha256(json.dumps(describe(policy.agent), sort_keys=True).encode()).hexdigest()
         runs.append({"source": str(file), "run": run, "kind": kind})
@@ -137,7 +155,9 @@ def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dic
 def _draw(report: Report, task: Task, output: Path) -> None:
     """Scores over the workspace, and how the agents of each row learnt."""
     heatmap(output / "heatmap.png", report.per_goal("final_score"), task.workspace, title="final score")
-    runs = {name: _folders(row.sources) for name, row in report.rows.items() if not name.endswith(IMAGE_GOALS)}
+    runs: dict[str, list[Path]] = {}
+    for name, row in report.rows.items():
+        runs.setdefault(name.removesuffix(IMAGE_GOALS), _folders(row.sources))
     learning_curves(output / "learning_curve.png", runs, CURVES)
 
 
@@ -147,7 +167,7 @@ def _one_task(policies: list[Policy], files: list[Path]) -> Task:
     for (task, index), file in zip(tasks, files, strict=True):
         if (task, index) != tasks[0]:
             this, first = (f"the {one.objects[number]!r} of {one}" for one, number in ((task, index), tasks[0]))
-            raise ValueError(f"{file} is about {this}, {files[0]} about {first}; evaluate them one after the other")
+            raise SettingsError(f"{file} is about {this}, {files[0]} about {first}; evaluate them one after the other")
     return tasks[0][0]
 
 

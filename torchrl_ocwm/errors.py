@@ -8,3 +8,7 @@ class UserError(Exception):
 
     All other errors are ours, and show their traceback.
     """
+
+
+class MissingPackageError(UserError, ModuleNotFoundError):
+    """A package that is not installed; the message says what installs it."""

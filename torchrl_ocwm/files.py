@@ -9,10 +9,12 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from torchrl_ocwm.errors import UserError
+
 _LOCK, _OWNER = ".lock", ".lock_owner"
 
 
-class FolderInUseError(RuntimeError):
+class FolderInUseError(UserError, RuntimeError):
     """Another process writes to the folder; the message names both."""
 
 

@@ -10,6 +10,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, ClassVar, TypeVar
 
+from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.settings import Settings, SettingsError, from_dict
 
 P = TypeVar("P", bound="type[Part]")
@@ -114,7 +115,9 @@ def load_plugins() -> None:
         except ModuleNotFoundError as error:
             if error.name not in (module, module.split(".")[0]):
                 raise
-            raise SettingsError(f"{VARIABLE} names {module!r}, which is not installed and not on PYTHONPATH") from None
+            raise MissingPackageError(
+                f"{VARIABLE} names {module!r}, which is not installed and not on PYTHONPATH", name=module
+            ) from None
 
 
 def foreign(settings: Any) -> dict[str, str]:

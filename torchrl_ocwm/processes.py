@@ -17,13 +17,15 @@ from typing import Any, Protocol
 import cloudpickle
 import torch
 
+from torchrl_ocwm.errors import UserError
+
 #: Makes the object, given a function to call now and then while it works: a sign of life.
 Make = Callable[[Callable[[], None]], Any]
 _START = 120.0  # seconds: a process has to import PyTorch and to load a simulator
 _SIGN = None
 
 
-class WorkerError(RuntimeError):
+class WorkerError(UserError, RuntimeError):
     """A process has ended, or gives no sign of life any more."""
 
 

@@ -239,10 +239,10 @@ def field_docs(kind: Any) -> dict[str, str]:
 
 
 def plain_text(docstring: str) -> str:
-    """Some of a docstring on one line, as Markdown has it and a terminal shows it.
+    r"""Some of a docstring on one line, as Markdown has it and a terminal shows it.
 
     Examples:
-        >>> plain_text("Draws ``n`` goals\\n    (:class:`~torchrl_ocwm.modules.UniformGoals`).")
+        >>> plain_text("Draws ``n`` goals\n    (:class:`~torchrl_ocwm.modules.UniformGoals`).")
         'Draws `n` goals (`UniformGoals`).'
     """
     text = re.sub(r":\w+:`(?:~[\w.]*\.)?([^`]*)`", r"`\1`", docstring)

@@ -16,10 +16,12 @@ from torchrl_ocwm import build_agent, save_agent
 from torchrl_ocwm.agents import AGENTS, EXPLORERS
 from torchrl_ocwm.agents.checkpoint import describe
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, ScriptedPolicy, SmoothRandomPolicy, object_coverage
-from torchrl_ocwm.data.collect import EpisodePlayer, collect, make_policy
+from torchrl_ocwm.data.collect import CollectionError, EpisodePlayer, collect, make_policy
 from torchrl_ocwm.data.settings import Collection
-from torchrl_ocwm.envs import Reacher, Task, make_task
+from torchrl_ocwm.envs import Reacher, SimulationDivergedError, Task, make_task
+from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.processes import WorkerError
+from torchrl_ocwm.settings import SettingsError
 
 collect_module = sys.modules["torchrl_ocwm.data.collect"]
 OPTIONS = {"horizon": 20, "image_size": 32}
@@ -247,7 +249,7 @@ def test_checkpoint_as_policy(tmp_path):
 
 
 def test_unknown_policy(tmp_path, no_collector):
-    with pytest.raises(ValueError, match="unknown policy 'rnd'; there are random, scripted and checkpoint files"):
+    with pytest.raises(SettingsError, match="policy must be random, scripted or a checkpoint file, got 'rnd'"):
         gather(tmp_path / "data", 20, policy="rnd")
 
 
@@ -284,7 +286,11 @@ def test_simulator_that_fails_again_and_again(tmp_path, monkeypatch):
     monkeypatch.setattr(collect_module, "EpisodePlayer", BreaksAt)
     monkeypatch.setattr(BreaksAt, "numbers", range(100))
     message = "4 episodes failed in a row, the last one with: the simulation diverged"
-    with pytest.warns(RuntimeWarning), pytest.raises(RuntimeError, match=message):
+    with pytest.warns(RuntimeWarning), pytest.raises(RuntimeError, match=message) as raised:
+        gather(tmp_path / "data", 60)
+    assert not isinstance(raised.value, UserError)  # nobody knows what it is: it shows its traceback
+    monkeypatch.setattr(BreaksAt, "error", SimulationDivergedError("the simulation diverged"))
+    with pytest.warns(RuntimeWarning), pytest.raises(CollectionError, match=message):
         gather(tmp_path / "data", 60)
     assert not (tmp_path / "data").exists()
 

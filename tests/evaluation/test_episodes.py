@@ -31,6 +31,7 @@ from torchrl_ocwm.evaluation import (
 )
 from torchrl_ocwm.evaluation.episodes import SteppedEnvs
 from torchrl_ocwm.processes import WorkerError
+from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.testing import random_records, reacher_task
 
 
@@ -267,7 +268,7 @@ def test_landmarks(task: Task) -> None:
     assert set(scores) == {f"evaluation/{name}" for name in ("final_score", "mean_score", "success", "final_distance")}
     assert scores == again  # each time the same episodes
     assert 0 < scores["evaluation/final_score"] < 1
-    with pytest.raises(ValueError, match="11 evaluation episodes, but reacher has 10 landmarks"):
+    with pytest.raises(SettingsError, match="eval_episodes=11, but reacher has 10 landmark goals"):
         LandmarkEvaluation(agent, episodes=11, episode_steps=3)
 
 

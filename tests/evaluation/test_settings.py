@@ -1,18 +1,13 @@
-"""What collecting, evaluating and diagnosing refuse, by name; what they are given is what the recipes say."""
+"""What collecting, evaluating and diagnosing refuse, by name."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import pytest
-from omegaconf import OmegaConf
 
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.evaluation.settings import Diagnosis, Evaluation
-
-CONFIG = Path(__file__).parents[2] / "examples" / "config"
 
 
 @pytest.mark.parametrize(
@@ -22,7 +17,7 @@ CONFIG = Path(__file__).parents[2] / "examples" / "config"
         (Collection, {"workers": -1}, "workers must be at least 0, got -1"),
         (Collection, {"seed": -1}, "seed must be at least 0"),
         (Collection, {"timeout": 0}, "timeout must be above 0, got 0"),
-        (Collection, {"timeout": float("nan")}, "timeout must be above 0, got nan"),
+        (Collection, {"timeout": float("nan")}, "timeout must be a number, got nan"),
         (Evaluation, {"goals": 0}, "goals must be at least 1"),
         (Evaluation, {"goals": 30}, "goals=30 is not a square grid; try 25 or 36"),
         (Evaluation, {"episode_steps": 0}, "episode_steps must be at least 1"),
@@ -42,9 +37,3 @@ CONFIG = Path(__file__).parents[2] / "examples" / "config"
 def test_refused(kind: Any, setting: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         kind(**setting)
-
-
-@pytest.mark.parametrize(("kind", "name"), [(Collection, "collect"), (Evaluation, "evaluate"), (Diagnosis, "diagnose")])
-def test_defaults_are_those_of_the_recipe(kind: Any, name: str) -> None:
-    config = OmegaConf.load(CONFIG / f"{name}.yaml")
-    assert {key: config[key] for key in asdict(kind())} == asdict(kind())

@@ -94,7 +94,7 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     [
         ("train_offline.py", ("agent=muzero",), "dreamer_pcp"),
         ("train_offline.py", ("dataset=/nowhere",), "DatasetError: /nowhere/dataset.json: no such file"),
-        ("collect.py", ("steps=0",), "ValueError: steps must be at least 1, got 0"),
+        ("collect.py", ("steps=0",), "SettingsError: steps must be at least 1, got 0"),
         ("evaluate.py", ("checkpoint=/nowhere.zip",), "CheckpointError: /nowhere.zip: no such checkpoint"),
     ],
 )

@@ -21,10 +21,11 @@ from torchrl_ocwm.agents import SIZES, Agent, build_agent, save_agent
 from torchrl_ocwm.agents.archive import Archive
 from torchrl_ocwm.agents.checkpoint import describe, rebuild
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals
+from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.evaluation import LandmarkEvaluation
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm
 from torchrl_ocwm.files import FolderInUseError
-from torchrl_ocwm.settings import change
+from torchrl_ocwm.settings import SettingsError, change
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
 from torchrl_ocwm.training import hooks
 from torchrl_ocwm.training.loggers import LogError
@@ -96,11 +97,8 @@ class TestResume:
     def test_training_changes_everything(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         before, after = fresh(), fresh()
         train(after, dataset, tmp_path)
-        parts = {"model": [], "actor": [], "loss": []}
-        for (name, old), new in zip(before.named_parameters(), after.parameters(), strict=True):
-            parts[name.split(".")[0]].append(not torch.equal(old, new))
-        for part in ("model", "actor"):
-            assert all(parts[part])
+        for old, new in zip(before.parameter_groups(), after.parameter_groups(), strict=True):
+            assert not any(torch.equal(*pair) for pair in zip(old["params"], new["params"], strict=True))
 
     def test_a_finished_run_is_left_alone(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         file = train(fresh(), dataset, tmp_path)
@@ -142,7 +140,7 @@ class TestGoingOn:
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
-            ({"goals": "stored"}, r"training\.goals: uniform there, stored here\); say training\.changed=\[goals\]"),
+            ({"goals": "stored"}, r"training\.goals: auto there, stored here\); say training\.changed=\[goals\]"),
             ({"final_lr": 0.5}, r"training\.final_lr: 0\.1 there, 0\.5 here"),
             ({"target_rate": 0.5}, r"training\.target_rate: 0\.02 there, 0\.5 here"),
             ({"mixed_precision": True}, r"training\.mixed_precision: False there, True here"),
@@ -198,8 +196,11 @@ class TestGoingOn:
         grown = random_dataset(tmp_path / "data", reacher_task())
         training = replace(SHORT, updates=2)
         file = train(fresh(), grown, tmp_path / "run", training)
-        records = random_records(reacher_task(), 1, 20, seed=7)[0]
-        grown.append(records)
+        with EpisodeDataset.open(grown.path, write=True) as grown:
+            records = random_records(reacher_task(), 1, 20, seed=7)[0]
+            records["action"][0] = 0
+            records["next", "done"][-1] = True
+            grown.append(records)
         with pytest.raises(CheckpointError, match=r"has grown by 1 episodes\); say training\.changed=\[dataset\]"):
             train(fresh(), grown, tmp_path / "run", training)
         train(fresh(), grown, tmp_path / "run", replace(training, updates=4, changed=("dataset",)))
@@ -266,6 +267,19 @@ class TestLooking:
         train(through, dataset, tmp_path / "through")
         assert same(resumed, through)
 
+    @pytest.mark.parametrize(("error", "kind"), [(TypeError("a bug"), RuntimeError), (LogError("x"), EvaluationError)])
+    def test_only_what_a_user_can_mend_becomes_one_line(
+        self, dataset: EpisodeDataset, tmp_path: Path, error: Exception, kind: type
+    ) -> None:
+        def fails(updates: int) -> dict[str, float]:
+            raise error
+
+        with pytest.raises(RuntimeError, match="the checkpoint of this update is kept") as raised:
+            train(fresh(), dataset, tmp_path, evaluate=fails)
+        assert type(raised.value) is kind
+        assert raised.value.__cause__ is error
+        assert updates_in(tmp_path / ZIP) == 2
+
     def test_the_checkpoint_that_is_due_comes_before_the_evaluation(
         self, dataset: EpisodeDataset, tmp_path: Path
     ) -> None:
@@ -301,21 +315,21 @@ class TestLooking:
         assert updates_in(file) == 4
 
     def test_too_few_landmarks_are_named_before_training(self) -> None:
-        with pytest.raises(ValueError, match="2 evaluation episodes, but reacher has 0 landmarks"):
+        with pytest.raises(SettingsError, match="eval_episodes=2, but reacher has 0 landmark goals"):
             LandmarkEvaluation(fresh(), episodes=2, episode_steps=3)
 
     def test_no_ffmpeg_is_named_before_training(
         self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-        with pytest.raises(ModuleNotFoundError, match=r"torchrl-ocwm\[recipes\]'.*video_interval=0"):
+        with pytest.raises(MissingPackageError, match=r"torchrl-ocwm\[recipes\]'.*video_interval=0"):
             OpenLoopFilm(fresh(), dataset, tmp_path)
 
     def test_no_tqdm_is_named_before_training(
         self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(hooks, "find_spec", lambda name: None)
-        with pytest.raises(ModuleNotFoundError, match=r"needs tqdm: pip install 'torchrl-ocwm\[recipes\]'"):
+        with pytest.raises(MissingPackageError, match=r"needs tqdm: pip install 'torchrl-ocwm\[recipes\]'"):
             train_offline(fresh(), dataset, tmp_path / "run", SHORT)
         assert not (tmp_path / "run").exists()
         train(fresh(), dataset, tmp_path / "run", replace(SHORT, updates=2))
@@ -474,11 +488,11 @@ class TestOtherReleases:
     def test_settings_that_are_gone(self) -> None:
         description = self.description()
         description["agent"]["colour"] = "red"
-        del description["size"]["architecture"]["belief"]
+        del description["size"]["learning"]["batch_size"]
         with pytest.raises(CheckpointError, match=r"agent\.colour is no setting"):
             rebuild(description)
         del description["agent"]["colour"]
-        with pytest.raises(CheckpointError, match=r"size\.architecture\.belief is missing"):
+        with pytest.raises(CheckpointError, match=r"size\.learning\.batch_size is missing"):
             rebuild(description)
 
 
@@ -568,7 +582,7 @@ class TestBadInput:
             {"changed": ("seed",)},
             "changed must name dataset, goals, .*final_lr, target_rate, got 'seed'",
         ),
-        ({"goals": "mine"}, "goals must be one of 'uniform', 'stored', got 'mine'"),
+        ({"goals": "mine"}, "goals must be one of 'auto', 'uniform', 'stored', got 'mine'"),
         ({"loggers": ("paper",)}, "loggers must be one of 'tensorboard', 'wandb', got 'paper'"),
     ],
 )

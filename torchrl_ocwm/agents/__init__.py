@@ -9,20 +9,23 @@ from torchrl_ocwm.agents.explorers import Disagreement, ExplorationReward, Objec
 from torchrl_ocwm.agents.goal_sources import (
     EnvironmentGoals,
     FrameGoalSource,
+    FutureGoalSource,
     GoalSource,
     MixedGoalSource,
     UniformGoalSource,
 )
-from torchrl_ocwm.agents.goals import Goal, GoalEncoding, NoGoal, ObjectLatent, Position
+from torchrl_ocwm.agents.goals import FullLatent, Goal, GoalEncoding, ImageEmbedding, NoGoal, ObjectLatent, Position
 from torchrl_ocwm.agents.optimizers import Adam, DreamerV3, OptimizerPart
 from torchrl_ocwm.agents.presets import AGENTS, EXPLORERS, SIZES, agent_name
 from torchrl_ocwm.agents.rewards import (
+    FullLatentCosine,
     ImaginedReward,
     LatentChord,
     LatentSimilarity,
     LearnedReward,
     PositionDistance,
     Reward,
+    TemporalDistance,
 )
 from torchrl_ocwm.agents.scene import Scene
 from torchrl_ocwm.agents.world_models import Flat, ObjectCentric, WorldModelPart
@@ -44,9 +47,13 @@ __all__ = [
     "ExplorationReward",
     "Flat",
     "FrameGoalSource",
+    "FullLatent",
+    "FullLatentCosine",
+    "FutureGoalSource",
     "Goal",
     "GoalEncoding",
     "GoalSource",
+    "ImageEmbedding",
     "ImaginedReward",
     "LatentChord",
     "LatentSimilarity",
@@ -66,6 +73,7 @@ __all__ = [
     "Scene",
     "Size",
     "StateEntropy",
+    "TemporalDistance",
     "UniformGoalSource",
     "WorldModelPart",
     "agent_name",

@@ -36,6 +36,7 @@ class Policy(TensorDictSequential):
         agent: The agent that it belongs to.
         behaviour: The behaviour.
         takes_images: Whether goals can be given as images.
+        takes_positions: Whether they can be given as positions.
     """
 
     def __init__(self, agent: Agent, behaviour: LearntBehaviour, *modules: TensorDictModuleBase) -> None:
@@ -54,6 +55,11 @@ class Policy(TensorDictSequential):
         """Which of the task's objects it is to position."""
         return self.behaviour.scene.object_index
 
+    @property
+    def takes_positions(self) -> bool:
+        goal = self.behaviour.goal
+        return goal is None or goal.position is not None
+
 
 class Agent(nn.Module):
     """A world model and behaviours for one task.
@@ -71,7 +77,7 @@ class Agent(nn.Module):
             (:class:`~torchrl_ocwm.data.RelabelGoals`).
 
     Raises:
-        ValueError: if the choices do not fit together or an image of the task cannot be halved by the CNN.
+        SettingsError: if the choices do not fit together or an image of the task cannot be halved by the CNN.
     """
 
     def __init__(self, task: Task, config: AgentConfig, size: Size) -> None:
@@ -89,11 +95,11 @@ class Agent(nn.Module):
         """A behaviour by its name; without one, that which acts.
 
         Raises:
-            ValueError: for an unknown name, with those that there are.
+            SettingsError: for an unknown name, with those that there are.
         """
         name = name or self.config.acting
         if name not in self.behaviours:
-            raise ValueError(f"unknown behaviour {name!r}; this agent has {', '.join(self.behaviours)}")
+            raise SettingsError(f"unknown behaviour {name!r}; this agent has {', '.join(self.behaviours)}")
         found = self.behaviours[name]
         assert isinstance(found, LearntBehaviour)
         return found

@@ -10,6 +10,7 @@ from torchrl_ocwm.agents.config import AgentConfig, Size
 from torchrl_ocwm.agents.presets import AGENTS, SIZES
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.parts import load_plugins
+from torchrl_ocwm.settings import SettingsError
 
 T = TypeVar("T")
 
@@ -23,7 +24,7 @@ def build_agent(agent: str | AgentConfig, task: Task, size: str | Size = "cpu") 
         size: A name of :data:`SIZES` or a size of your own.
 
     Raises:
-        ValueError: for an unknown name, with those that there are, or for choices that do not fit together.
+        SettingsError: for an unknown name, with those that there are, or for choices that do not fit together.
 
     Examples:
         >>> from torchrl_ocwm.testing import reacher_task
@@ -40,5 +41,5 @@ def _by_name(choice: str | T, choices: Mapping[str, T], what: str) -> T:
     if choice not in choices:
         load_plugins()
     if choice not in choices:
-        raise ValueError(f"unknown {what} {choice!r}; there are {', '.join(choices)}")
+        raise SettingsError(f"unknown {what} {choice!r}; there are {', '.join(choices)}")
     return choices[choice]

@@ -60,7 +60,8 @@ def load_agent(path: str | Path, *, behaviour: str | None = None, device: torch.
 
     Raises:
         CheckpointError: if there is no checkpoint, a damaged one, or not one of an agent of this library.
-        ValueError: if there is no such device, or no such behaviour.
+        DeviceError: if there is no such device.
+        ValueError: if there is no such behaviour.
     """
     path, device = Path(path), usable_device(device)
     agent = rebuild(read_description(path))

@@ -7,10 +7,10 @@ from typing import Any
 
 from torchrl_ocwm.agents.config import EXPLORE, REACH, AgentConfig, Behaviour, Learning, Size
 from torchrl_ocwm.agents.explorers import Disagreement, ObjectEntropy, StateEntropy
-from torchrl_ocwm.agents.goal_sources import UniformGoalSource
-from torchrl_ocwm.agents.goals import ObjectLatent, Position
+from torchrl_ocwm.agents.goal_sources import FrameGoalSource, UniformGoalSource
+from torchrl_ocwm.agents.goals import FullLatent, ImageEmbedding, ObjectLatent, Position
 from torchrl_ocwm.agents.optimizers import Adam, DreamerV3
-from torchrl_ocwm.agents.rewards import LatentChord, PositionDistance
+from torchrl_ocwm.agents.rewards import FullLatentCosine, LatentChord, PositionDistance, TemporalDistance
 from torchrl_ocwm.agents.world_models import Flat, ObjectCentric
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.world_model import VectorName
@@ -34,6 +34,8 @@ AGENTS = {
     "focus": AgentConfig(ObjectCentric(observed=_WITH_GOAL)),
     "focus_pcp": AgentConfig(ObjectCentric(), {REACH: _PCP}),
     "focus_lcp": AgentConfig(ObjectCentric(), {REACH: _LCP}),
+    "lexa_cosine": AgentConfig(Flat(), {REACH: Behaviour(FullLatent(), FullLatentCosine(), FrameGoalSource())}),
+    "lexa_temporal": AgentConfig(Flat(), {REACH: Behaviour(ImageEmbedding(), TemporalDistance(), FrameGoalSource())}),
     "plan2explore": AgentConfig(Flat(), {EXPLORE: EXPLORERS["plan2explore"]}),
     "focus_explore": AgentConfig(ObjectCentric(), {EXPLORE: EXPLORERS["focus_explore"]}),
 }

@@ -18,7 +18,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from tqdm import tqdm
 
 from torchrl_ocwm.agents.checkpoint import load_agent
 from torchrl_ocwm.data.coverage import dataset_coverage
@@ -28,7 +27,18 @@ from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import ScriptedAction, Task, find_environment, make_env, make_task
+from torchrl_ocwm.envs.missing import needs
+from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.processes import Make, Worker, make_worker
+from torchrl_ocwm.settings import SettingsError
+
+with needs("a collection", "recipes"):
+    from tqdm import tqdm
+
+
+class CollectionError(UserError, RuntimeError):
+    """One episode after the other failed, in a simulator or in a process."""
+
 
 #: What a dataset keeps of an environment's observations.
 STORED = (
@@ -97,10 +107,11 @@ def collect(
 
     Raises:
         DatasetError: if the folder holds a dataset of another environment or other options, or cannot be written.
-        ValueError: for an unknown policy, or a checkpoint of another task's agent.
+        SettingsError: for an unknown policy, or a checkpoint of another task's agent.
         CheckpointError: for a file that is no checkpoint of an agent.
         WorkerError: if a process ends before it has begun.
-        RuntimeError: if one episode after the other fails.
+        CollectionError: if one episode after the other fails, in the simulator or with its process. What fails
+            otherwise is raised as a ``RuntimeError``.
     """
     if isinstance(settings, int):
         settings = Collection(steps=settings, **more)
@@ -142,7 +153,7 @@ def make_policy(
     """A policy's name in the index of a dataset, and the module that acts: of an agent, one of its behaviours.
 
     Raises:
-        ValueError: for an unknown name, a checkpoint of another task's agent, or a behaviour that it does not have.
+        SettingsError: for an unknown name, a checkpoint of another task's agent, or a behaviour that it does not have.
         CheckpointError: for a file that is no checkpoint of an agent.
     """
     if isinstance(policy, TensorDictModuleBase):
@@ -150,11 +161,11 @@ def make_policy(
     if policy in POLICIES:
         return str(policy), POLICIES[str(policy)](task.action)
     if not Path(policy).is_file():
-        raise ValueError(f"unknown policy {str(policy)!r}; there are {', '.join(POLICIES)} and checkpoint files")
+        raise SettingsError(f"policy must be {', '.join(POLICIES)} or a checkpoint file, got {str(policy)!r}")
     loaded = load_agent(policy, behaviour=behaviour)
     if loaded.agent.task != task:
-        raise ValueError(
-            f"{policy}: the agent was trained for {loaded.agent.task.name!r} with options "
+        raise SettingsError(
+            f"policy={policy}: the agent was trained for {loaded.agent.task.name!r} with options "
             f"{loaded.agent.task.options}, not for {task.name!r} with {task.options}"
         )
     return f"{policy} ({behaviour})" if behaviour else str(policy), loaded
@@ -210,7 +221,8 @@ def play_in_order(
 
     Raises:
         WorkerError: if a process ends before it has begun.
-        RuntimeError: if one episode after the other fails.
+        CollectionError: if one episode after the other fails, in the simulator or with its process. What fails
+            otherwise is raised as a ``RuntimeError``.
     """
     begin = partial(make_worker, make_player, process=settings.workers > 0, timeout=settings.timeout)
     numbers, failures = count(first), 0
@@ -245,7 +257,8 @@ def check_failures(failures: int, error: RuntimeError) -> None:
     if isinstance(error, NotImplementedError):
         raise error
     if failures > MAX_FAILURES:
-        raise RuntimeError(f"{failures} episodes failed in a row, the last one with: {error}") from error
+        kind = CollectionError if isinstance(error, UserError) else RuntimeError
+        raise kind(f"{failures} episodes failed in a row, the last one with: {error}") from error
     warnings.warn(f"an episode failed ({error}) and is left out; a new process goes on", RuntimeWarning, stacklevel=2)
 
 

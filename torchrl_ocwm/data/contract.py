@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.errors import UserError
 
 #: Keys that a dataset of a task may be without.
 OPTIONAL = ("next/masks", "next/depth", "next/goal_position", "next/object_position_true", "next/truncated")
@@ -18,7 +19,7 @@ _POSITIONS = ("next/object_position", "next/goal_position", "next/object_positio
 _FAR = 10
 
 
-class DatasetError(ValueError):
+class DatasetError(UserError, ValueError):
     """A dataset cannot be read or written; the message names the file and the reason."""
 
 

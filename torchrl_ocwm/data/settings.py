@@ -35,7 +35,7 @@ class Collection(Settings):
     behaviour: str | None = None
     workers: int = setting(2, at_least=0, at_most=1024)
     seed: int = setting(0, at_least=0, at_most=2**32 - 1)
-    timeout: float = setting(120.0, above=0)
+    timeout: float = setting(120.0, above=0, at_most=10**6)
 
     def validate(self) -> None:
         """Only agents have behaviours."""

@@ -6,15 +6,21 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from torchrl_ocwm.errors import MissingPackageError, UserError
+
 _NOT_FOR_3_13 = ("dm_control", "robosuite")
 
 
-def missing(what: str, module: str, extra: str) -> ModuleNotFoundError:
+class SystemLibraryError(UserError, ImportError):
+    """A package cannot be loaded, for want of a library of the system; the message says what installs it."""
+
+
+def missing(what: str, module: str, extra: str) -> MissingPackageError:
     """What to install where ``module`` is missing, on one line: an extra of this package, or a package of its name."""
     remedy = f"pip install 'torchrl-ocwm[{extra}]'" if extra else f"pip install {module}"
     if module.split(".")[0] in _NOT_FOR_3_13 and sys.version_info >= (3, 13):
         remedy = "there is none for Python 3.13 and newer; use 3.10, 3.11 or 3.12"
-    return ModuleNotFoundError(f"{what} needs {module}, which is not installed: {remedy}", name=module)
+    return MissingPackageError(f"{what} needs {module}, which is not installed: {remedy}", name=module)
 
 
 @contextmanager
@@ -22,15 +28,15 @@ def needs(what: str, extra: str) -> Iterator[None]:
     """Imports that ``what`` needs, which ``extra`` installs.
 
     Raises:
-        ModuleNotFoundError: if a package is missing, with the extra to install.
-        ImportError: if a package lacks a library of the system, with what to install.
+        MissingPackageError: if a package is missing, with the extra to install.
+        SystemLibraryError: if a package lacks a library of the system, with what to install.
     """
     try:
         yield
     except ModuleNotFoundError as error:
         raise missing(what, str(error.name), extra) from None
     except ImportError as error:
-        raise ImportError(
+        raise SystemLibraryError(
             f"{what} needs a library of the system that is missing ({error}): for OpenCV, "
             "`apt-get install libgl1 libglib2.0-0`, or `pip install opencv-python-headless` instead of opencv-python"
         ) from error

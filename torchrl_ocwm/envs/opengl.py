@@ -13,17 +13,22 @@ from importlib.util import find_spec
 from typing import Any
 
 from torchrl_ocwm.envs.missing import missing
+from torchrl_ocwm.errors import UserError
 
 #: Everything that holds an OpenGL context and has a ``close`` method.
 OPEN: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
+class RenderingError(UserError, RuntimeError):
+    """There is no OpenGL library that works here; the message says what installs one."""
 
 
 def import_mujoco() -> Any:
     """Import MuJoCo, which loads the OpenGL library that ``MUJOCO_GL`` names.
 
     Raises:
-        ModuleNotFoundError: if MuJoCo is not installed, with the extra to install.
-        RuntimeError: if the OpenGL library is missing, with what to install.
+        MissingPackageError: if MuJoCo is not installed, with the extra to install.
+        RenderingError: if the OpenGL library is missing, with what to install.
     """
     if find_spec("mujoco") is None:
         raise missing("rendering", "mujoco", "dm-control")
@@ -58,10 +63,10 @@ def _register_exit() -> None:
     atexit.register(_close_all)
 
 
-def renderer_error(error: BaseException) -> RuntimeError:
+def renderer_error(error: BaseException) -> RenderingError:
     """What to install, on one line."""
     reason = " ".join(str(error).split()) or "no details"
-    return RuntimeError(
+    return RenderingError(
         f"MuJoCo cannot render off screen ({type(error).__name__}: {reason}; MUJOCO_GL="
         f"{os.environ.get('MUJOCO_GL', '')!r}). Install a software renderer: `apt-get install libegl1 libgl1-mesa-dri`"
         " for MUJOCO_GL=egl (the default), or `apt-get install libosmesa6` for MUJOCO_GL=osmesa."

@@ -7,6 +7,8 @@ from typing import Literal
 
 from torchrl_ocwm.settings import Settings, SettingsError, setting
 
+LARGEST = 16384  # pixels on a side
+
 
 @dataclass(frozen=True)
 class EnvOptions(Settings):
@@ -26,6 +28,12 @@ class EnvOptions(Settings):
     mask_scale: int = setting(1, at_least=1, at_most=64)
     virtual_target: int = setting(0, at_least=0)
 
+    def validate(self) -> None:
+        """The segmentation fits into the buffers of OpenGL."""
+        side = self.image_size * self.mask_scale
+        if side > LARGEST:
+            raise SettingsError(f"mask_scale times image_size must be at most {LARGEST} pixels, got {side}")
+
 
 @dataclass(frozen=True)
 class CubeMoveOptions(EnvOptions):
@@ -41,6 +49,7 @@ class CubeMoveOptions(EnvOptions):
 
     def validate(self) -> None:
         """The cube alone or both."""
+        super().validate()
         if self.objects not in (("cube",), ("cube", "distractor")):
             raise SettingsError(f"objects must be [cube] or [cube, distractor], got {list(self.objects)}")
 

@@ -15,6 +15,7 @@ from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.positions import masks_to_positions
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.envs.workspace import Workspace
+from torchrl_ocwm.errors import UserError
 
 with needs("an environment", "dm-control"):
     import gymnasium
@@ -27,8 +28,12 @@ _FARTHEST = 100  # times the size of the model; nothing gets there but by a jump
 Observation = dict[str, np.ndarray]
 
 
-class SimulationDivergedError(RuntimeError):
+class SimulationDivergedError(UserError, RuntimeError):
     """The physics of an episode broke down, and what it showed since means nothing. A reset starts a new one."""
+
+
+class NoScriptedPolicyError(UserError, NotImplementedError):
+    """The environment has no scripted policy."""
 
 
 class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -166,14 +171,14 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
 
         Raises:
             ValueError: for a goal outside the workspace.
-            NotImplementedError: if the environment has no such policy.
+            NoScriptedPolicyError: if the environment has no such policy.
         """
         goal = self._goal if goal_position is None else self._check_goal(goal_position)
         return self._scripted_action(goal, np.asarray(error)).clip(-1, 1).astype(np.float32)
 
-    def _scripted_action(self, goal: np.ndarray, error: np.ndarray) -> np.ndarray:
+    def _scripted_action(self, goal: np.ndarray, error: np.ndarray) -> np.ndarray:  # noqa: ARG002
         """What :meth:`scripted_action` does, without bounds; an environment may go without."""
-        raise NotImplementedError(f"{type(self).__name__} has no scripted policy; collect with policy=random")
+        raise NoScriptedPolicyError(f"{type(self).__name__} has no scripted policy; collect with policy=random")
 
     # Gymnasium's interface.
 

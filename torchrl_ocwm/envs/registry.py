@@ -152,8 +152,8 @@ def make_env(
         given at reset: ``env.reset(TensorDict({"goal_position": goals}, env.batch_size))``.
 
     Raises:
-        ValueError: for an unknown name.
-        ModuleNotFoundError: if the simulator is missing, with the extra to install.
+        SettingsError: for an unknown name.
+        MissingPackageError: if the simulator is missing, with the extra to install.
 
     Examples:
         >>> env = make_env("reacher", horizon=50, seed=0)

@@ -35,7 +35,7 @@ class ScriptedAction(Transform):
         action_key: Key written, ``[A]`` float32 in [−1, 1].
 
     Raises:
-        NotImplementedError: at the first reset, if the environment has no scripted policy.
+        NoScriptedPolicyError: at the first reset, if the environment has no scripted policy.
 
     Examples:
         >>> from torchrl_ocwm.envs import make_env

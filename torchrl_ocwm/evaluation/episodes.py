@@ -12,15 +12,18 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
-from tqdm import tqdm
 
 from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
 from torchrl_ocwm.envs import Task, find_environment, make_env, make_scene
+from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.evaluation.randomness import EpisodeRandomness
 from torchrl_ocwm.evaluation.scores import normalized_score
 from torchrl_ocwm.processes import Worker, make_worker
+
+with needs("an evaluation", "recipes"):
+    from tqdm import tqdm
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 _KEPT = ("object_position", "object_position_true", "reward")

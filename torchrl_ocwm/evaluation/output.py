@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.files import replacing
 
 
-class OutputError(RuntimeError):
+class OutputError(UserError, RuntimeError):
     """A result, picture or video cannot be written; the message names the file and the reason."""
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.scores import mean_and_error, score_is_undefined
 
@@ -24,6 +25,10 @@ COLUMNS = {
     "entity_error": ("entity reconstruction error, m", 3),
     "goal_error": ("goal reconstruction error, m", 3),
 }
+
+
+class ReportError(UserError, ValueError):
+    """Results that cannot be read, or do not go together."""
 
 
 @dataclass
@@ -70,7 +75,7 @@ class Report:
         """Read a ``results.json`` that :meth:`save` wrote.
 
         Raises:
-            ValueError: if it is something else.
+            ReportError: if it is something else.
         """
         try:
             values = json.loads(Path(file).read_text())
@@ -81,19 +86,19 @@ class Report:
                     row.get("kind", agent), [_tensors(seed) for seed in row["per_goal"]], row["sources"], runs
                 )
         except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{file}: not the results.json of an evaluation ({error!r})") from error
+            raise ReportError(f"{file}: not the results.json of an evaluation ({error!r})") from error
         return report
 
     def include(self, other: Report) -> None:
         """Add the rows of another report.
 
         Raises:
-            ValueError: if it was made with other goals or settings, or holds a run that is here already.
+            ReportError: if it was made with other goals or settings, or holds a run that is here already.
         """
         if self.goals.shape != other.goals.shape or not torch.allclose(self.goals, other.goals):
-            raise ValueError("these results were made with other goals")
+            raise ReportError("these results were made with other goals")
         if self.settings != other.settings:
-            raise ValueError(f"these results were made with other settings: {other.settings}, here {self.settings}")
+            raise ReportError(f"these results were made with other settings: {other.settings}, here {self.settings}")
         for agent, row in other.rows.items():
             for metrics, source, run in zip(row.seeds, row.sources, row.runs, strict=True):
                 self.add(agent, metrics, source=source, run=run, kind=row.kind)
@@ -119,12 +124,12 @@ class Report:
             kind: What tells the agent from others of its name; nothing by default.
 
         Raises:
-            ValueError: if the row has that run already.
+            ReportError: if the row has that run already.
         """
         kind, run = agent if kind is None else kind, source if run is None else run
         row = self.rows.setdefault(self._row_name(agent, kind), Row(kind))
         if run in row.runs:
-            raise ValueError(
+            raise ReportError(
                 f"{source}: the same run as {row.sources[row.runs.index(run)]}, which counts as a seed of {agent} "
                 "already; leave one of them out"
             )

@@ -17,7 +17,7 @@ class Evaluation(Settings):
         goals: Goals, laid out as a square grid over the reachable workspace.
         episode_steps: Steps per episode.
         image_goals: Also give the goals as images, what would be seen with the object there, to the agents that take
-            them.
+            both. Those that take nothing else get them anyway.
         random: Also evaluate smooth random actions.
         workers: Processes; 0 steps all environments in the process that evaluates. Scores do not depend on it.
         envs: Environments stepped in each process. Scores do not depend on it.
@@ -42,7 +42,7 @@ class Evaluation(Settings):
     envs: int = setting(10, at_least=1, at_most=10**4)
     video_goals: int = setting(6, at_least=0)
     seed: int = setting(0, at_least=0, at_most=2**32 - 1)
-    timeout: float = setting(120.0, above=0)
+    timeout: float = setting(120.0, above=0, at_most=10**6)
 
     def validate(self) -> None:
         """A square grid."""

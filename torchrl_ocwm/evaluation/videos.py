@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.data.dataset import EpisodeDataset
+from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.evaluation.objects import decode_objects
 from torchrl_ocwm.evaluation.open_loop import open_loop_latents
 from torchrl_ocwm.evaluation.output import writing
@@ -25,14 +26,14 @@ def check_ffmpeg() -> None:
     """Raise where no video can be written.
 
     Raises:
-        ModuleNotFoundError: with what to install.
+        MissingPackageError: with what to install.
     """
     try:
         import imageio_ffmpeg
 
         imageio_ffmpeg.get_ffmpeg_exe()
     except (ModuleNotFoundError, RuntimeError) as error:
-        raise ModuleNotFoundError(
+        raise MissingPackageError(
             "videos need ffmpeg: pip install 'torchrl-ocwm[recipes]', or ask for none (training.video_interval=0)",
             name="imageio_ffmpeg",
         ) from error
@@ -143,7 +144,7 @@ class OpenLoopFilm:
         context: Frames that the model sees.
 
     Raises:
-        ModuleNotFoundError: if there is no ffmpeg to write them with.
+        MissingPackageError: if there is no ffmpeg to write them with.
 
     Called with the number of updates; returns the file that it wrote.
     """

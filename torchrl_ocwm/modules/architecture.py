@@ -38,17 +38,17 @@ class Architecture(Settings):
     """
 
     style: Style = "dreamer_v3"
-    cnn_depth: int = setting(8, at_least=1)
-    cnn_mults: tuple[int, ...] = setting((1, 2, 4, 8), at_least=1)
-    categoricals: int = setting(16, at_least=1)
-    classes: int = setting(16, at_least=1)
-    belief: int = setting(128, at_least=1)
-    hidden: int = setting(128, at_least=1)
-    gru_blocks: int = setting(8, at_least=1)
-    mlp_layers: int = setting(2, at_least=1)
-    mlp_units: int = setting(128, at_least=1)
-    object_features: int = setting(128, at_least=1)
-    extractor_units: int = setting(128, at_least=1)
+    cnn_depth: int = setting(8, at_least=1, at_most=10**4)
+    cnn_mults: tuple[int, ...] = setting((1, 2, 4, 8), at_least=1, at_most=1000)
+    categoricals: int = setting(16, at_least=1, at_most=10**4)
+    classes: int = setting(16, at_least=1, at_most=10**4)
+    belief: int = setting(128, at_least=1, at_most=10**6)
+    hidden: int = setting(128, at_least=1, at_most=10**6)
+    gru_blocks: int = setting(8, at_least=1, at_most=10**4)
+    mlp_layers: int = setting(2, at_least=1, at_most=1000)
+    mlp_units: int = setting(128, at_least=1, at_most=10**6)
+    object_features: int = setting(128, at_least=1, at_most=10**6)
+    extractor_units: int = setting(128, at_least=1, at_most=10**6)
 
     @property
     def mlp(self) -> dict[str, Any]:

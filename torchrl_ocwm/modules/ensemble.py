@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch.nn.functional import elu, rms_norm, silu
 
 from torchrl_ocwm.modules.architecture import Style
-from torchrl_ocwm.modules.choices import check_choice
 from torchrl_ocwm.modules.world_model import bounded
+from torchrl_ocwm.settings import read
 
 
 class StackedLinear(nn.Module):
@@ -73,7 +73,7 @@ class OneStepEnsemble(nn.Module):
         style: Style = "dreamer_v3",
     ) -> None:
         super().__init__()
-        check_choice("style", style, Style)
+        read(Style, style, "style")
         if members < 2:
             raise ValueError(f"members must be at least 2 to disagree, got {members}")
         sizes = [in_features, *([units] * layers), out_features]

@@ -21,7 +21,7 @@ from torchrl.modules import (
 
 from torchrl_ocwm.modules.architecture import Architecture, Style
 from torchrl_ocwm.modules.dtypes import unit_image
-from torchrl_ocwm.settings import read
+from torchrl_ocwm.settings import SettingsError, read
 
 UNIMIX = 0.01
 
@@ -59,7 +59,7 @@ def make_image_encoder(architecture: Architecture, image_size: int) -> tuple[nn.
     """A CNN for images ``[..., 3, H, W]`` uint8 or float32 in [0, 1], and the number of features that it gives.
 
     Raises:
-        ValueError: if the image does not go through the CNN.
+        SettingsError: if the image does not go through the CNN.
     """
     depth, mults = architecture.cnn_depth, architecture.cnn_mults
     _check_image_size(architecture, image_size)
@@ -114,12 +114,12 @@ def make_rssm(architecture: Architecture, *, action: int, embedding: int) -> tup
 
 def _check_image_size(architecture: Architecture, image_size: int) -> None:
     if architecture.style == "dreamer_v2" and image_size != 64:
-        raise ValueError(
+        raise SettingsError(
             f"the CNN of style 'dreamer_v2' takes images of 64 x 64 pixels, got {image_size} x {image_size}"
         )
     stages = len(architecture.cnn_mults)
     if image_size % 2**stages:
-        raise ValueError(
+        raise SettingsError(
             f"a CNN of {stages} stages halves the image {stages} times, which an image of {image_size} x "
             f"{image_size} pixels does not allow; use a multiple of {2**stages}"
         )

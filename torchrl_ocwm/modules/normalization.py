@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from torchrl_ocwm.modules.choices import check_choice
+from torchrl_ocwm.settings import read
 
 Normalization = Literal["none", "scale", "standard"]
 
@@ -43,7 +43,7 @@ class StreamingNorm(nn.Module):
 
     def __init__(self, mode: Normalization = "standard", *, rate: float = 0.01, epsilon: float = 1e-6) -> None:
         super().__init__()
-        check_choice("mode", mode, Normalization)
+        read(Normalization, mode, "mode")
         self.mode, self.rate, self.epsilon = mode, rate, epsilon
         self.register_buffer("mean", torch.zeros(()))
         self.register_buffer("square", torch.ones(()))

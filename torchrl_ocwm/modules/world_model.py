@@ -13,10 +13,11 @@ from torch import Tensor, nn
 from torchrl.modules import RSSMRolloutV3, RSSMStateEstimatorV3, SymExpTwoHot
 
 from torchrl_ocwm.modules.architecture import Architecture
-from torchrl_ocwm.modules.latent import InitialLatent, LatentOfImages
+from torchrl_ocwm.modules.latent import FullLatent, InitialLatent, LatentOfImages, LatentsInEmbedding, LatentsInImages
 from torchrl_ocwm.modules.networks import make_image_decoder, make_mlp, make_rssm
 from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.units import WorkspaceUnits
+from torchrl_ocwm.settings import SettingsError
 
 VectorName = Literal["proprio", "object_position", "goal_position"]
 _KEYS: dict[str, str] = {"proprio": "proprio", "object_position": "object_units", "goal_position": "goal_units"}
@@ -201,6 +202,7 @@ class FlatWorldModel(WorldModel):
         image_size: Height and width of the images, pixels.
         observed: Vectors that the encoder sees and the decoder reconstructs.
         architecture: Shapes of the networks.
+        image_latent: Whether the latents of images alone are learnt, which are goals then.
         kwargs: The other arguments of :class:`WorldModel`.
 
     Examples:
@@ -218,11 +220,33 @@ class FlatWorldModel(WorldModel):
         image_size: int,
         observed: tuple[VectorName, ...],
         architecture: Architecture,
+        image_latent: bool = False,
         **kwargs: Any,
     ) -> None:
         scene: dict[str, Any] = {"image_size": image_size, "observed": observed, "architecture": architecture}
         super().__init__(decoded=observed, **scene, **kwargs)
         self.image_decoder = make_image_decoder(architecture, self.latent_features, image_size)
+        self.image_latent = image_latent
+
+    def records(self) -> TensorDictSequential:
+        """Posterior, prior and predictions for records ``[B, T]``; everything is read and written under ``next``.
+
+        With ``image_latent`` also the latent ``image_latent`` ``[B, T, S + H]`` of each image alone, as if it were the
+        first frame of an episode, and the positions ``reco_image_units`` ``[B, T, O * D]`` in it.
+        """
+        records = super().records()
+        if not self.image_latent:
+            return records
+        embedding, image = ("next", "encoded_latents"), ("next", "image_latent")
+        modules = [TensorDictModule(LatentsInEmbedding(self.latent_in_images()), [embedding], [image])]
+        if "object_position" in self.vector_decoders:
+            decoder = self.vector_decoders["object_position"]
+            modules.append(TensorDictModule(decoder, [image], [("next", "reco_image_units")]))
+        return TensorDictSequential(records, *modules)
+
+    def latent_in_images(self) -> LatentsInImages:
+        """State and belief ``[..., S + H]`` after images ``[..., F, 3, H, W]`` uint8, one after the other."""
+        return LatentsInImages(self.encoder, self.latent_of_images(), FullLatent())
 
     def images(self, *at: str) -> list[TensorDictModuleBase]:
         """``reco_pixels``."""
@@ -236,10 +260,12 @@ class FlatWorldModel(WorldModel):
         """Decoded object positions ``object_units`` ``[..., O * D]``, in workspace units.
 
         Raises:
-            ValueError: if the model does not decode them.
+            SettingsError: if the model does not decode them.
         """
         if "object_position" not in self.vector_decoders:
-            raise ValueError("this world model does not decode object positions; add 'object_position' to `observed`")
+            raise SettingsError(
+                "this world model does not decode object positions; add 'object_position' to `observed`"
+            )
         return TensorDictModule(self.vector_decoders["object_position"], latent_at(("latent",)), ["object_units"])
 
 

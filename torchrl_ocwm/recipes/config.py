@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -21,9 +22,9 @@ from torchrl_ocwm.agents import AGENTS, EXPLORERS, SIZES
 from torchrl_ocwm.agents.config import EXPLORE
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.errors import UserError
-from torchrl_ocwm.files import replacing
-from torchrl_ocwm.parts import load_plugins
-from torchrl_ocwm.settings import field_docs, from_dict, to_dict
+from torchrl_ocwm.evaluation.output import writing
+from torchrl_ocwm.parts import Part, load_plugins
+from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
 
 T = TypeVar("T")
 _QUIET = ("job_logging", "hydra_logging")
@@ -48,15 +49,12 @@ def recipe(
         kind: type[T] = next(iter(get_type_hints(function).values()))
 
         def guarded(config: DictConfig) -> None:
-            try:
-                function(from_dict(kind, OmegaConf.to_container(config, resolve=True, throw_on_missing=True)))
-            except (UserError, CheckpointError, OmegaConfBaseException) as error:
-                if os.environ.get("HYDRA_FULL_ERROR") == "1":
-                    raise
-                sys.exit(f"{type(error).__name__}: {error}")
+            with _user_errors():
+                function(from_dict(kind, _given(config)))
 
         def main() -> None:
-            store_options()
+            with _user_errors():
+                store_options()
             ConfigStore.instance().store(name, _schema(kind, groups or {}, more))
             hydra.main(version_base="1.3", config_path=None, config_name=name)(guarded)()
 
@@ -71,18 +69,23 @@ def store_options() -> None:
     store = ConfigStore.instance()
     for group, rows in (("agent", AGENTS), ("size", SIZES)):
         for name, row in rows.items():
-            store.store(name, to_dict(row), group=group)
+            # Not closed: a part may be replaced by one with other settings, which the classes know.
+            store.store(name, OmegaConf.create(to_dict(row), flags={"struct": False}), group=group)
     store.store("none", {}, group="explore", package="_global_")
     for name, behaviour in EXPLORERS.items():  # beside the behaviours of the row
-        store.store(name, to_dict(behaviour), group="explore", package=f"agent.behaviours.{EXPLORE}")
+        node = OmegaConf.create(to_dict(behaviour), flags={"struct": False})
+        store.store(name, node, group="explore", package=f"agent.behaviours.{EXPLORE}")
     for name, environment in ENVIRONMENTS.items():
         store.store(name, {"name": name, "options": defaults(environment.options)}, group="env")
 
 
 def keep_settings(settings: Any, folder: Path) -> None:
-    """Keep the settings of a run in its folder, as ``config.yaml``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / "config.yaml") as new:
+    """Keep the settings of a run in its folder, as ``config.yaml``.
+
+    Raises:
+        OutputError: if it cannot be written.
+    """
+    with writing(folder / "config.yaml") as new:
         OmegaConf.save(OmegaConf.create(to_dict(settings)), new)
 
 
@@ -114,7 +117,7 @@ def help_lines(kind: type, at: str = "") -> Iterator[str]:
             yield f"{name}{value}: {docs.get(one.name, '')}"
 
 
-def defaults(kind: type) -> dict[str, Any]:
+def defaults(kind: Any) -> dict[str, Any]:
     """The fields of a settings class with their defaults; ``"???"``, as Hydra has it, for what has to be given.
 
     Examples:
@@ -125,6 +128,17 @@ def defaults(kind: type) -> dict[str, Any]:
     return {one.name: _default(one) for one in fields(kind)}
 
 
+@contextmanager
+def _user_errors() -> Iterator[None]:
+    """What a user can mend ends the script with one line."""
+    try:
+        yield
+    except (UserError, CheckpointError, OmegaConfBaseException) as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        sys.exit(" ".join(f"{type(error).__name__}: {error}".split()))
+
+
 def _schema(kind: type, groups: Mapping[str, str], more: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration of a recipe: its groups, and all other settings with their defaults."""
     plain = {name: value for name, value in defaults(kind).items() if name not in groups}
@@ -133,6 +147,29 @@ def _schema(kind: type, groups: Mapping[str, str], more: Mapping[str, Any]) -> d
     text = "\n".join(help_lines(kind)).replace("$", "")
     own = {"run": {"dir": "."}, "output_subdir": None, "help": {"header": f"Settings:\n{text}\n"}, **more}
     return {"defaults": [*chosen, "_self_", *quiet], **plain, "hydra": own}
+
+
+def _given(config: DictConfig) -> dict[str, Any]:
+    """The settings as plain values, all of which are there."""
+    if lacking := sorted(OmegaConf.missing_keys(config)):
+        raise SettingsError(f"{lacking[0]} is missing; give it, as in {lacking[0]}=...")
+    values: Any = OmegaConf.to_container(config, resolve=True)
+    choices = HydraConfig.get().runtime.choices
+    for group, rows in (("agent", AGENTS), ("size", SIZES)):
+        if group in values and choices.get(group) in rows:
+            values[group] = _without_leftovers(values[group], to_dict(rows[choices[group]]))
+    return values
+
+
+def _without_leftovers(values: Any, row: Any) -> Any:
+    """A row with changes, without the settings of parts that others replaced: Hydra merges the two."""
+    if not isinstance(values, dict) or not isinstance(row, dict):
+        return values
+    if values.get("name") == row.get("name"):
+        return {name: _without_leftovers(value, row.get(name)) for name, value in values.items()}
+    parts = [kind[values["name"]] for kind in Part.registered.values() if values["name"] in kind]
+    known = {one.name for part in parts for one in fields(part)}
+    return {name: value for name, value in values.items() if name in known or row.get(name) != value}
 
 
 def _default(one: Any) -> Any:

@@ -12,6 +12,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.trainers import Trainer
 
+from torchrl_ocwm.errors import MissingPackageError, UserError
+
 
 class UpdateClock:
     """Takes the place of a collector when nothing is collected: each tick stands for one update.
@@ -34,6 +36,10 @@ class UpdateClock:
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Nothing to restore."""
+
+
+class DivergedError(UserError, FloatingPointError):
+    """A loss is not finite; the message names it."""
 
 
 class LossLog:
@@ -66,12 +72,12 @@ class LossLog:
         """Look at the losses since the last line of the log.
 
         Raises:
-            FloatingPointError: with the losses that are not finite.
+            DivergedError: with the losses that are not finite.
         """
         losses = {} if self._total is None else dict(self._total.items())
         bad = [name for name, value in losses.items() if name.startswith("loss_") and not value.isfinite().all()]
         if bad:
-            raise FloatingPointError(
+            raise DivergedError(
                 f"after {updates} updates {', '.join(sorted(bad))} is not finite; check the data and the learning "
                 "rates. The last checkpoint is still good."
             )
@@ -187,14 +193,14 @@ class ProgressBar:
         disable: Show nothing.
 
     Raises:
-        ModuleNotFoundError: if tqdm is missing, with the extra to install.
+        MissingPackageError: if tqdm is missing, with the extra to install.
     """
 
     def __init__(self, shown: tuple[str, ...], *, disable: bool = False) -> None:
         self.shown, self.disable = shown, disable
         self.bar: Any = None
         if not disable and find_spec("tqdm") is None:
-            raise ModuleNotFoundError(
+            raise MissingPackageError(
                 "a progress bar needs tqdm: pip install 'torchrl-ocwm[recipes]', or train with progress=False",
                 name="tqdm",
             )

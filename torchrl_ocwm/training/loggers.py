@@ -10,10 +10,12 @@ from typing import Any
 from torch import Tensor
 from torchrl.record.loggers import CSVLogger, Logger
 
+from torchrl_ocwm.errors import MissingPackageError, UserError
 from torchrl_ocwm.files import replacing
+from torchrl_ocwm.settings import SettingsError
 
 
-class LogError(RuntimeError):
+class LogError(UserError, RuntimeError):
     """The log cannot be written; the message says where and why."""
 
 
@@ -84,15 +86,15 @@ def make_loggers(folder: Path, also: tuple[str, ...] = (), *, name: str = "run")
         name: Name of the run, where runs have names.
 
     Raises:
-        ValueError: for an unknown logger.
-        ModuleNotFoundError: if its package is missing, with the extra to install.
+        SettingsError: for an unknown logger.
+        MissingPackageError: if its package is missing, with the extra to install.
     """
     loggers: list[Logger] = [CSVLogger("log", log_dir=str(folder))]
     for kind in also:
         if kind not in ("tensorboard", "wandb"):
-            raise ValueError(f"unknown logger {kind!r}; there are tensorboard and wandb, beside the CSV files")
+            raise SettingsError(f"unknown logger {kind!r}; there are tensorboard and wandb, beside the CSV files")
         if find_spec(kind) is None:
-            raise ModuleNotFoundError(
+            raise MissingPackageError(
                 f"logger {kind!r} is not installed: pip install 'torchrl-ocwm[{kind}]'", name=kind
             )
         if kind == "tensorboard":

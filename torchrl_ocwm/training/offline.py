@@ -53,11 +53,12 @@ def train_offline(
         CheckpointError: if the folder's checkpoint is damaged, of another agent, or was trained with something else, or
             a checkpoint cannot be written.
         FolderInUseError: if another process trains in the folder.
-        FloatingPointError: if a loss is not finite.
-        EvaluationError: if ``evaluate`` fails; the checkpoint of that update is written.
+        DivergedError: if a loss is not finite.
+        EvaluationError: if ``evaluate`` fails for a reason that the user can mend. The checkpoint of that update is
+            written, whatever it fails for.
         LogError: if the log cannot be written.
-        ValueError: if there is no such device.
-        ModuleNotFoundError: if the package of a logger or of the progress bar is missing.
+        DeviceError: if there is no such device.
+        MissingPackageError: if the package of a logger or of the progress bar is missing.
     """
     folder = Path(folder)
     training = replace(training, device=str(usable_device(training.device)))

@@ -18,6 +18,7 @@ from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.archive import Archive, recover
 from torchrl_ocwm.agents.checkpoint import check_same_agent, describe
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals, make_replay_buffer
+from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.files import only_writer
 from torchrl_ocwm.training.hooks import Every, LossLog, ProgressBar, RunTrainer, StopOnSignals, UpdateClock
 from torchrl_ocwm.training.loggers import make_loggers
@@ -32,8 +33,8 @@ Evaluate = Callable[[int], dict[str, float]]
 Film = Callable[[int], Path]
 
 
-class EvaluationError(RuntimeError):
-    """An evaluation during training failed; the message says that nothing is lost."""
+class EvaluationError(UserError, RuntimeError):
+    """An evaluation during training failed, for a reason that the user can mend; nothing is lost."""
 
 
 class Run:
@@ -124,10 +125,13 @@ class Run:
             return evaluate(updates)
         except Exception as error:
             self._save(updates)
-            raise EvaluationError(
+            message = (
                 f"the evaluation after {updates} updates failed ({type(error).__name__}: {error}); the checkpoint of "
-                "this update is kept: run the same command again to go on, with eval_interval=0 if need be"
-            ) from error
+                "this update is kept: run the same command again to go on, with training.eval_interval=0 if need be"
+            )
+            if isinstance(error, (UserError, OSError)):  # what the machine or the settings lack
+                raise EvaluationError(message) from error
+            raise RuntimeError(message) from error
 
     def _film(self, film: Film, updates: int) -> None:
         try:
