@@ -1,7 +1,8 @@
 """Train an agent that collects its data: ``python examples/train_online.py agent=focus_lcp env=cube_move size=cpu``.
 
-Can be stopped (Ctrl-C, SIGTERM, killed) and run again: it goes on with the same dataset and checkpoint.
-``train_offline.py`` can train on the dataset at any time.
+``explore=focus_explore`` gives it an explorer, which plays every other episode. Can be stopped (Ctrl-C, SIGTERM,
+killed) and run again: it goes on with the same dataset and checkpoint. ``train_offline.py`` can train on the dataset at
+any time.
 """
 
 from __future__ import annotations

@@ -167,7 +167,7 @@ def _without_leftovers(values: Any, row: Any) -> Any:
         return values
     if values.get("name") == row.get("name"):
         return {name: _without_leftovers(value, row.get(name)) for name, value in values.items()}
-    parts = [kind[values["name"]] for kind in Part.registered.values() if values["name"] in kind]
+    parts: list[Any] = [kind[values["name"]] for kind in Part.registered.values() if values["name"] in kind]
     known = {one.name for part in parts for one in fields(part)}
     return {name: value for name, value in values.items() if name in known or row.get(name) != value}
 
