@@ -176,10 +176,7 @@ def diagnose(
             patch.setattr(module, "latent_pairs", note_pairs)
             for name in ("draw_errors", "draw_goal_latents"):
                 patch.setattr(module, name, lambda *_: None)
-            patch.setattr(
-                module, "picture_objects", lambda out, model, records, *_: seen["pictured"].append(len(records))
-            )
-            patch.setattr(module, "usable_device", usable_device, raising=False)
+            patch.setattr(module, "picture_objects", lambda *given: seen["pictured"].append(len(given[2])))
             small = {"sequences": 3, "length": 6, "context": 2, "frames": 5, "dataset": files["data"], "output": "out"}
             named = {argument.partition("=")[0] for argument in arguments}
             rest = [f"{name}={value}" for name, value in small.items() if name not in named]
