@@ -98,7 +98,8 @@ def _goals(agent: Agent, records: TensorDictBase, settings: Diagnosis, output: P
     model = agent.model
     if not isinstance(model, ObjectWorldModel) or model.positional_encoder is None:
         return {}
-    pairs, positions = latent_pairs(model, records, frames=settings.frames, seed=settings.seed)
+    index = agent.policy().object_index
+    pairs, positions = latent_pairs(model, records, frames=settings.frames, object_index=index, seed=settings.seed)
     draw_goal_latents(output / "goal_latents.png", pairs, positions)
     return {name: match(*pair, positions) for name, pair in pairs.items()}
 

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -20,7 +22,7 @@ from torchrl_ocwm import load_agent
 from torchrl_ocwm.agents import Agent, Policy, agent_name
 from torchrl_ocwm.agents.checkpoint import describe
 from torchrl_ocwm.data import SmoothRandomPolicy
-from torchrl_ocwm.envs import ENVIRONMENTS, Task
+from torchrl_ocwm.envs import Task, find_environment, make_scene
 from torchrl_ocwm.evaluation import (
     EvaluationEnvs,
     ReconstructionError,
@@ -44,7 +46,8 @@ from torchrl_ocwm.signals import ended_by_signals
 from torchrl_ocwm.training.offline import CHECKPOINT
 
 CONTEXT = 5  # frames that are seen before the objects are imagined
-IMAGE_GOALS = ", image goals"
+IMAGE_GOALS = ", image goals"  # after the name of a row; without it goals are positions
+FILMS = {"": "episodes.mp4", IMAGE_GOALS: "episodes_image_goals.mp4"}
 CURVES = {
     "evaluation/final_score": "final score, landmark goals",
     "return_high": "imagined return, 95th percentile",
@@ -79,11 +82,13 @@ class Evaluate(Evaluation):
 def main(config: Evaluate) -> None:
     settings = config
     files = [Path(one) for one in ([config.checkpoint] if isinstance(config.checkpoint, str) else config.checkpoint)]
-    policies = [load_agent(file) for file in files]
-    task, output = _one_task(policies, files), Path(config.output)
+    policies = [load_agent(file, behaviour=settings.behaviour) for file in files]
+    task, about, output = _one_task(policies, files), policies[0].object_index, Path(config.output)
     goals = task.workspace.grid(settings.grid_size).flatten(0, 1)
-    images = goal_images(task, goals) if settings.image_goals else None
-    report = _report(goals, settings, config.include)
+    images = None
+    if settings.image_goals or not all(policy.takes_positions for policy in policies):
+        images = goal_images(task, goals, object_index=about)
+    report = _report(goals, settings, config.include, {"object": task.objects[about]} if about else {})
     runs = _runs(files, policies, report)
     with EvaluationEnvs(
         task,
@@ -94,27 +99,35 @@ def main(config: Evaluate) -> None:
     ) as envs:
         if settings.random and "random" not in report.rows:
             played = envs.run(SmoothRandomPolicy(task.action), goals, seed=settings.seed, progress=True)
-            report.add("random", measure(played), source="smooth actions")
+            report.add("random", measure(played, object_index=about), source="smooth actions")
         for policy, run in zip(policies, runs, strict=True):
-            name = agent_name(policy.agent.config)
-            report.add(name, _evaluate(policy, envs, goals, settings.seed), **run)
-            if images is not None and policy.takes_images:
-                report.add(name + IMAGE_GOALS, _evaluate(policy, envs, goals, settings.seed, images), **run)
+            name = agent_name(policy.agent.config) + (f", {settings.behaviour}" if settings.behaviour else "")
+            for kind in _goal_kinds(policy, settings.image_goals):
+                scores = _evaluate(policy, envs, goals, settings.seed, images if kind == IMAGE_GOALS else None)
+                report.add(name + kind, scores, **run)
         report.save(output)
         print(report.markdown())
         _draw(report, task, output)
         if settings.video_goals:
             chosen = torch.linspace(0, len(goals) - 1, min(settings.video_goals, settings.goals)).round().long()
             film = partial(_film, policies[-1], envs, goals, chosen, settings.seed)
-            _picture_objects(policies[-1].agent, film(output / "episodes.mp4"), output)
-            if images is not None and policies[-1].takes_images:
-                film(output / "episodes_image_goals.mp4", images)
+            films = [
+                film(output / FILMS[kind], images if kind == IMAGE_GOALS else None)
+                for kind in _goal_kinds(policies[-1], settings.image_goals)
+            ]
+            _picture_objects(policies[-1].agent, films[0], output)
     print(f"\ntable, numbers, heatmap, learning curve, videos: {output}")
 
 
-def _report(goals: Tensor, settings: Evaluation, include: Sequence[str]) -> Report:
+def _goal_kinds(policy: Policy, image_goals: bool) -> list[str]:
+    """What goals a policy is evaluated with, by the end of its row's name: images too, or if it takes nothing else."""
+    positions = [""] if policy.takes_positions else []
+    return positions + [IMAGE_GOALS] * (policy.takes_images and (image_goals or not positions))
+
+
+def _report(goals: Tensor, settings: Evaluation, include: Sequence[str], more: dict[str, Any]) -> Report:
     """An empty report, or one with the rows of earlier ones."""
-    kept = {"goals": settings.goals, "episode_steps": settings.episode_steps, "seed": settings.seed}
+    kept = {"goals": settings.goals, "episode_steps": settings.episode_steps, "seed": settings.seed, **more}
     report = Report(goals, {**kept, "starts": "by goal"})  # earlier releases: by place among the environments
     for file in include:
         report.include(Report.load(file))
@@ -142,16 +155,20 @@ def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dic
 def _draw(report: Report, task: Task, output: Path) -> None:
     """Scores over the workspace, and how the agents of each row learnt."""
     heatmap(output / "heatmap.png", report.per_goal("final_score"), task.workspace, title="final score")
-    runs = {name: _folders(row.sources) for name, row in report.rows.items() if not name.endswith(IMAGE_GOALS)}
+    runs: dict[str, list[Path]] = {}
+    for name, row in report.rows.items():
+        runs.setdefault(name.removesuffix(IMAGE_GOALS), _folders(row.sources))
     learning_curves(output / "learning_curve.png", runs, CURVES)
 
 
 def _one_task(policies: list[Policy], files: list[Path]) -> Task:
-    tasks = [policy.agent.task for policy in policies]
-    for task, file in zip(tasks, files, strict=True):
-        if task != tasks[0]:
-            raise SettingsError(f"{file} is of {task}, {files[0]} of {tasks[0]}; evaluate them one after the other")
-    return tasks[0]
+    """The task of all of them; scores of different objects are not to be compared either."""
+    tasks = [(policy.agent.task, policy.object_index) for policy in policies]
+    for (task, index), file in zip(tasks, files, strict=True):
+        if (task, index) != tasks[0]:
+            this, first = (f"the {one.objects[number]!r} of {one}" for one, number in ((task, index), tasks[0]))
+            raise SettingsError(f"{file} is about {this}, {files[0]} about {first}; evaluate them one after the other")
+    return tasks[0][0]
 
 
 def _folders(sources: list[str]) -> list[Path]:
@@ -162,7 +179,7 @@ def _folders(sources: list[str]) -> list[Path]:
 def _evaluate(
     policy: Policy, envs: EvaluationEnvs, goals: Tensor, seed: int, images: Tensor | None = None
 ) -> dict[str, Tensor]:
-    reconstruct = ReconstructionError(policy.agent)
+    reconstruct = ReconstructionError(policy.agent, object_index=policy.object_index)
 
     def inspect(step: TensorDictBase) -> dict[str, Tensor | TensorDictBase]:
         return {**reconstruct(step), "latent": step["latent"].select("state", "belief", "goal", strict=False)}
@@ -171,9 +188,14 @@ def _evaluate(
     errors = {name: episodes[name].mean(1) for name in ("entity_error", "goal_error") if name in episodes}
     if "object_position" in policy.agent.model.observed:
         errors["imagined_distance"] = imagined_distance(
-            policy.agent, episodes["latent"][:, 0], goals, envs.episode_steps, seed=seed
+            policy.behaviour,
+            episodes["latent"][:, 0],
+            goals,
+            envs.episode_steps,
+            object_index=policy.object_index,
+            seed=seed,
         )
-    return {**measure(episodes), **errors}
+    return {**measure(episodes, object_index=policy.object_index), **errors}
 
 
 def _film(
@@ -197,12 +219,10 @@ def _film(
         return {"latent": step["latent"], **transition(step)}
 
     episodes = envs.run(policy, goals, images=images, seed=seed, numbers=chosen, inspect=inspect)
-    latents = imagined_rollout(policy.agent, episodes["latent"][:, 0], envs.episode_steps, seed=seed)["latent"]
+    latents = imagined_rollout(policy.behaviour, episodes["latent"][:, 0], envs.episode_steps, seed=seed)["latent"]
     imagined = decode_video(policy.agent.model, latents)
-    import gymnasium
-
-    with gymnasium.make(ENVIRONMENTS[task.name].id, **task.options) as env:
-        points = torch.as_tensor(env.unwrapped.project(goals.numpy()))
+    with closing(make_scene(find_environment(task.name), **task.options)) as scene:
+        points = torch.as_tensor(scene.project(goals.numpy()))
     rows = [mark(episodes["transition", "next", "pixels"], points), mark(imagined, points)]
     if images is not None:
         rows.insert(0, images.unsqueeze(1).expand_as(rows[0]))

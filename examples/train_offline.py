@@ -1,5 +1,7 @@
 """Train an agent on a dataset: ``python examples/train_offline.py agent=dreamer_pcp env=reacher size=cpu``.
 
+``explore=plan2explore`` teaches the agent to explore too, beside its task.
+
 Can be stopped (Ctrl-C, SIGTERM) and run again: it goes on where it was, to the same parameters.
 """
 
@@ -47,7 +49,7 @@ class TrainOffline(Settings):
     )
 
 
-@recipe("train_offline", {"agent": "dreamer_pcp", "env": "reacher", "size": "cpu"})
+@recipe("train_offline", {"agent": "dreamer_pcp", "explore": "none", "env": "reacher", "size": "cpu"})
 def main(config: TrainOffline) -> None:
     training = config.training
     dataset = EpisodeDataset.open(config.dataset)

@@ -16,7 +16,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_ocwm.agents import AGENTS, Agent, build_agent
+from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
+from torchrl_ocwm.envs import ENVIRONMENTS
+from torchrl_ocwm.parts import Part
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records, reacher_task
 
@@ -24,10 +26,23 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 #: What a command of a recipe has to say, whatever else it says.
 REQUIRED = {"evaluate": ["checkpoint=a.zip"], "diagnose": ["checkpoint=a.zip", "dataset=data"]}
 
+collect_ignore = ["plugin/ocwm_example"]  # a package that the tests import when they want its parts
+
 
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="module")
+def registries() -> Iterator[None]:
+    """What the tests of a module register is gone afterwards."""
+    tables: list[dict[str, Any]] = [AGENTS, SIZES, ENVIRONMENTS, *Part.registered.values()]
+    before = [dict(table) for table in tables]
+    yield
+    for table, content in zip(tables, before, strict=True):
+        table.clear()
+        table.update(content)
 
 
 @pytest.fixture

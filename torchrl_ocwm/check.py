@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import sys
-from importlib.util import find_spec
 
 
 def main() -> int:
     """Make each environment whose simulator is installed, and say how it went on one line each."""
     try:
         from torchrl_ocwm.envs import ENVIRONMENTS, make_env
-        from torchrl_ocwm.envs.missing import missing
+        from torchrl_ocwm.envs.registry import not_installed
 
         for name, environment in ENVIRONMENTS.items():
-            if find_spec(environment.module) is None:
-                sys.stdout.write(f"{missing(name, environment.module, environment.extra)}\n")
+            if (error := not_installed(environment)) is not None:
+                sys.stdout.write(f"{error}\n")
                 continue
             make_env(name).close()
             sys.stdout.write(f"{name}: simulates and renders\n")

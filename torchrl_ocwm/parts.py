@@ -113,6 +113,39 @@ def load_plugins() -> None:
         try:
             import_module(module)
         except ModuleNotFoundError as error:
-            if error.name != module.partition(".")[0] and error.name != module:
-                raise  # the plugin's own
-            raise MissingPackageError(f"{VARIABLE}={module}: there is no such module", name=module) from error
+            if error.name not in (module, module.split(".")[0]):
+                raise
+            raise MissingPackageError(
+                f"{VARIABLE} names {module!r}, which is not installed and not on PYTHONPATH", name=module
+            ) from None
+
+
+def foreign(settings: Any) -> dict[str, str]:
+    """The parts of other packages in settings, as ``"kind name"`` → package.
+
+    Raises:
+        SettingsError: for a part that is not registered: nobody could build it again by its name.
+    """
+    if not isinstance(settings, Settings):
+        values = settings.values() if isinstance(settings, Mapping) else ()
+        return {name: package for one in values for name, package in foreign(one).items()}
+    found = foreign({one.name: getattr(settings, one.name) for one in fields(settings)})  # type: ignore[arg-type]
+    if isinstance(settings, Part):
+        known, package = settings.name_and_kind(), type(settings).__module__.split(".")[0]
+        if known is None:
+            raise SettingsError(f"{type(settings).__name__} has no name: put @register('its_name') on the class")
+        if package != __name__.split(".")[0]:
+            found[f"{known[1]} {known[0]}"] = package
+    return found
+
+
+def absent(parts: Any) -> list[str]:
+    """Which of the parts that :func:`foreign` gave, here or elsewhere, are not registered here; in words."""
+    load_plugins()
+    given = parts.items() if isinstance(parts, Mapping) else ()
+    unknown = [
+        (*part.split(" ", 1), package)
+        for part, package in given
+        if part not in {f"{kind} {name}" for kind, names in Part.registered.items() for name in names}
+    ]
+    return [f"{kind} {name!r} of the package {package!r}" for kind, name, package in unknown]

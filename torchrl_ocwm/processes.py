@@ -100,7 +100,7 @@ class ProcessWorker:
     def __init__(self, make: Make, timeout: float) -> None:
         ours, theirs = socket.socketpair()
         self._timeout, self._socket, self._answers = timeout, ours, ours.makefile("rb")
-        with theirs, _interrupts_ignored():
+        with theirs, interrupts_ignored():
             self._process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True)
             self._process.start()
         self._socket.settimeout(max(timeout, _START))
@@ -172,7 +172,7 @@ def _how(code: int | None) -> str:
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
+def interrupts_ignored() -> Iterator[None]:
     """What is started here is born deaf to Ctrl-C: it would show a traceback while it starts."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -186,7 +186,7 @@ def _interrupts_ignored() -> Iterator[None]:
 
 def _serve(channel: socket.socket) -> None:
     """The process: make the object, then answer calls until the other end is closed."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     torch.set_num_threads(1)
     calls = channel.makefile("rb")
     last = time.monotonic()
@@ -213,7 +213,12 @@ def _serve(channel: socket.socket) -> None:
             send((None, _picklable(error), traceback.format_exc()))
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """Let this process end as soon as the one that started it has ended, however that was."""
+    threading.Thread(target=_wait_for_parent, daemon=True).start()
+
+
+def _wait_for_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

@@ -234,8 +234,19 @@ def field_docs(kind: Any) -> dict[str, str]:
         section = cleandoc(base.__dict__.get("__doc__") or "").partition("Args:\n")[2]
         section = re.split(r"\n\S", section, maxsplit=1)[0]
         entries = re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", section, re.MULTILINE)
-        docs.update({name: " ".join(text.split()).replace("``", "`") for name, text in entries})
+        docs.update({name: plain_text(text) for name, text in entries})
     return docs
+
+
+def plain_text(docstring: str) -> str:
+    r"""Some of a docstring on one line, as Markdown has it and a terminal shows it.
+
+    Examples:
+        >>> plain_text("Draws ``n`` goals\n    (:class:`~torchrl_ocwm.modules.UniformGoals`).")
+        'Draws `n` goals (`UniformGoals`).'
+    """
+    text = re.sub(r":\w+:`(?:~[\w.]*\.)?([^`]*)`", r"`\1`", docstring)
+    return " ".join(text.split()).replace("``", "`")
 
 
 _hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from torchrl_ocwm.agents import (
     AGENTS,
@@ -33,7 +34,12 @@ def test_every_row_learns_and_acts(name: str) -> None:
     losses = agent.loss(records)
     assert all(value.isfinite() for key, value in losses.items() if key.startswith("loss_"))
     step = records["next"][:, 0].exclude("reward", "done", "terminated").set("is_init", records["is_init"][:, 0])
-    assert agent.policy()(step)["action"].shape == (2, task.action)
+    policy = agent.policy()
+    if not policy.takes_positions:
+        with pytest.raises(ValueError, match="takes goals as images only"):
+            policy(step.clone())
+        step["goal"] = TensorDict({"pixels": step["pixels"]}, [2])
+    assert policy(step)["action"].shape == (2, task.action)
 
 
 def test_who_sees_the_goal() -> None:

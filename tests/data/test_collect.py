@@ -12,10 +12,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
-from torchrl_ocwm import build_agent
+from torchrl_ocwm import build_agent, save_agent
+from torchrl_ocwm.agents import AGENTS, EXPLORERS
 from torchrl_ocwm.agents.checkpoint import describe
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, ScriptedPolicy, SmoothRandomPolicy, object_coverage
-from torchrl_ocwm.data.collect import CollectionError, EpisodePlayer, collect
+from torchrl_ocwm.data.collect import CollectionError, EpisodePlayer, collect, make_policy
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import Reacher, SimulationDivergedError, Task, make_task
 from torchrl_ocwm.errors import UserError
@@ -370,3 +371,20 @@ def test_foreign_index(tmp_path, no_collector):
     (tmp_path / "dataset.json").write_text('{"format": "another"}')
     with pytest.raises(DatasetError, match=r"dataset\.json: not an index of"):
         gather(tmp_path, 10)
+
+
+def test_which_behaviour_collects(tmp_path):
+    """And the index says which."""
+    task = make_task("reacher", **OPTIONS)
+    row = AGENTS["dreamer_pcp"].and_behaviours(explore=EXPLORERS["plan2explore"])
+    file = save_agent(build_agent(row, task, "debug"), tmp_path / "agent.zip")
+    for behaviour, name in (("explore", f"{file} (explore)"), (None, str(file))):
+        shown, policy = make_policy(file, task, behaviour)
+        assert shown == name
+        assert policy.behaviour is policy.agent.behaviours[behaviour or "reach"]
+    found = gather(tmp_path / "data", 20, policy=file, behaviour="explore")
+    assert found.metadata["policies"] == {f"{file} (explore)": 1}
+    with pytest.raises(ValueError, match="unknown behaviour 'play'; this agent has reach, explore"):
+        gather(tmp_path / "data", 40, policy=file, behaviour="play")
+    with pytest.raises(ValueError, match="behaviour does nothing: policy='random' has none; give it a checkpoint"):
+        Collection(behaviour="explore")

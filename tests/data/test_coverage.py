@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_ocwm.data import Coverage, EpisodeDataset, dataset_coverage, object_coverage
+from torchrl_ocwm.data import Coverage, EpisodeDataset, coverage_curve, dataset_coverage, object_coverage
 from torchrl_ocwm.envs import Workspace
 
 SQUARE = Workspace(low=(0.0, 0.0), high=(1.0, 1.0))
@@ -50,3 +50,15 @@ def test_each_object_of_a_dataset(tmp_path, truth):
     dataset = EpisodeDataset.create(tmp_path, example=records[0])
     dataset.append(records)
     assert dataset_coverage(dataset, ("a", "b"), SQUARE) == {"a": Coverage(1.0, 0.1), "b": Coverage(0.0, 0.01)}
+
+
+def test_curve_is_that_of_the_first_episodes() -> None:
+    """Episodes of other lengths: each point counts whole ones, the last all."""
+    lengths = [3, 5, 2, 6, 4]
+    path = torch.rand(sum(lengths), 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    curve = coverage_curve(path, lengths, SQUARE, points=5)
+    assert list(curve) == [2, 6, 7, 12, 15]
+    assert curve[6] == object_coverage(path[:8], [3, 5], SQUARE)
+    assert curve[15] == object_coverage(path, lengths, SQUARE)
+    assert list(coverage_curve(path, lengths, SQUARE, points=2)) == [6, 15]
+    assert list(coverage_curve(path, lengths, SQUARE, points=50)) == list(curve)

@@ -11,7 +11,7 @@ from torchrl_ocwm import build_agent
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.data.contract import OPTIONAL, record_keys
 from torchrl_ocwm.testing import random_records, reacher_task
-from torchrl_ocwm.training import offline
+from torchrl_ocwm.training import run
 from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.settings import Training
 
@@ -209,4 +209,4 @@ def test_an_agent_that_needs_what_is_missing(tmp_path):
     with pytest.raises(DatasetError, match=r"holds no \[\('next', 'masks'\)\], which this agent learns from"):
         train_offline(agent, dataset, tmp_path / "run", Training(updates=50))
     assert not (tmp_path / "run").exists()
-    offline._check_task(build_agent("dreamer_pcp", TASK, "debug"), dataset)
+    run.check_task(build_agent("dreamer_pcp", TASK, "debug"), dataset)

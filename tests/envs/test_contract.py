@@ -380,10 +380,10 @@ def test_a_body_that_leaves_the_world_ends_the_episode(env: PositioningEnv) -> N
 
 def test_hidden_object_keeps_its_last_position(env: PositioningEnv, case: Case, hide: Callable[..., None]) -> None:
     env.reset(seed=14, options={"goal_position": GOAL})
-    env._teleport(env.data, np.array([-0.1, 0.1]))
+    env._teleport(env.data, np.array([-0.1, 0.1]), 0)
     seen, *_ = env.step(still(env))
     hide()
-    env._teleport(env.data, env._check_goal(GOAL))
+    env._teleport(env.data, env._check_goal(GOAL), 0)
     for _ in range(2):
         hidden, reward, *_ = env.step(still(env))
         assert hidden["object_visible"].tolist() == [False]

@@ -13,6 +13,7 @@ import torch
 
 from torchrl_ocwm import load_agent
 from torchrl_ocwm.agents import AGENTS
+from torchrl_ocwm.agents.config import REACH
 from torchrl_ocwm.envs import ENVIRONMENTS
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -41,7 +42,8 @@ def collected(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     return request.param, path
 
 
-@pytest.mark.parametrize("agent", AGENTS)
+# Those that only explore do so in test_exploration.py.
+@pytest.mark.parametrize("agent", [name for name, row in AGENTS.items() if row.acting == REACH])
 def test_from_dataset_to_film(collected: tuple[str, Path], agent: str, tmp_path: Path) -> None:
     env, dataset = collected
     output = tmp_path / "run"

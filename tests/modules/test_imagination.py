@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import pytest
@@ -24,10 +25,10 @@ def test_specs(agent: Agent) -> None:
     check_env_specs(agent.imagination)
 
 
-@pytest.mark.parametrize("name", ["dreamer", "dreamer_pcp"])
+@pytest.mark.parametrize("name", ["dreamer", "dreamer_pcp", "plan2explore"])
 def test_rollout_is_torchrls(make_agent: Any, name: str) -> None:
     """The short cut gives what EnvBase.rollout gives, number by number."""
-    agent = make_agent(name)
+    agent = make_agent(name).eval()  # a normalised reward counts its calls
     start = agent.imagination.reset().expand(4).clone()
     options = {"auto_reset": False, "tensordict": start, "break_when_any_done": False}
     torch.manual_seed(1)
@@ -49,7 +50,15 @@ def times(keys: list[Any], out: str) -> TensorDictModule:
 
 @pytest.mark.parametrize(
     ("in_reward", "in_policy"),
-    [("action", None), ("weight", None), ("loc", None), (None, "weight"), (("latent", "weight"), ("latent", "weight"))],
+    [
+        ("action", None),
+        ("weight", None),
+        ("loc", None),
+        (None, "weight"),
+        (("latent", "weight"), ("latent", "weight")),
+        (("before", "goal"), None),
+        (("before", "state"), "loc"),
+    ],
 )
 def test_what_reward_and_policy_read_is_there(agent: Agent, in_reward: Any, in_policy: Any) -> None:
     """Beside the latent, and in it: the action, what the policy writes, and what was there at the start."""
@@ -78,10 +87,27 @@ def test_a_policy_that_does_not_say_what_it_reads(agent: Agent) -> None:
     torch.testing.assert_close(rollout["action"], rollout["latent", "state"][..., :2])
 
 
-def test_the_short_cut_is_taken(agent: Agent, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["dreamer_pcp", "plan2explore", "focus_explore"])
+def test_the_short_cut_is_taken(make_agent: Any, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    agent = make_agent(name)
     monkeypatch.setattr(EnvBase, "rollout", None)
     start = agent.imagination.reset().expand(4).clone()
     assert agent.imagination.rollout(3, agent.actor, tensordict=start, **FIXED).shape == (4, 3)
+
+
+@pytest.mark.parametrize("short", [True, False])
+def test_a_reward_sees_the_step_that_it_judges(short: bool) -> None:
+    """Before, action and after of each step: 0 + 1 = 1, 1 + 1 = 2, 2 + 1 = 3."""
+    keys: list[Any] = [("latent", "state"), ("latent", "belief")]
+    transition = TensorDictModule(lambda state, belief, action: (state + action, belief), [*keys, "action"], keys)
+    seen: list[Any] = [("before", "state"), "action", ("latent", "state")]
+    reward = TensorDictModule(lambda before, action, after: 100 * before + 10 * action + after, seen, ["reward"])
+    policy = TensorDictModule(torch.ones_like, [("latent", "state")], ["action"])
+    env = ImaginationEnv(transition, reward, state=1, belief=1, action=1)
+    start = env.reset().expand(2).clone().apply(torch.zeros_like)
+    rollout = env.rollout if short else partial(EnvBase.rollout, env)
+    got = rollout(3, policy, tensordict=start, **FIXED)["next", "reward"]
+    torch.testing.assert_close(got, torch.tensor([[11.0], [112.0], [213.0]]).expand(2, 3, 1))
 
 
 def test_an_ordinary_rollout_works_too(agent: Agent) -> None:

@@ -5,23 +5,27 @@ from torchrl_ocwm.agents.behaviour import LearntBehaviour
 from torchrl_ocwm.agents.build import build_agent
 from torchrl_ocwm.agents.checkpoint import load_agent, save_agent
 from torchrl_ocwm.agents.config import AgentConfig, Behaviour, Learning, Size
+from torchrl_ocwm.agents.explorers import Disagreement, ExplorationReward, ObjectEntropy, StateEntropy
 from torchrl_ocwm.agents.goal_sources import (
     EnvironmentGoals,
     FrameGoalSource,
+    FutureGoalSource,
     GoalSource,
     MixedGoalSource,
     UniformGoalSource,
 )
-from torchrl_ocwm.agents.goals import Goal, GoalEncoding, NoGoal, ObjectLatent, Position
+from torchrl_ocwm.agents.goals import FullLatent, Goal, GoalEncoding, ImageEmbedding, NoGoal, ObjectLatent, Position
 from torchrl_ocwm.agents.optimizers import Adam, DreamerV3, OptimizerPart
-from torchrl_ocwm.agents.presets import AGENTS, SIZES, agent_name
+from torchrl_ocwm.agents.presets import AGENTS, EXPLORERS, SIZES, agent_name
 from torchrl_ocwm.agents.rewards import (
+    FullLatentCosine,
     ImaginedReward,
     LatentChord,
     LatentSimilarity,
     LearnedReward,
     PositionDistance,
     Reward,
+    TemporalDistance,
 )
 from torchrl_ocwm.agents.scene import Scene
 from torchrl_ocwm.agents.world_models import Flat, ObjectCentric, WorldModelPart
@@ -30,19 +34,26 @@ from torchrl_ocwm.parts import register
 
 __all__ = [
     "AGENTS",
+    "EXPLORERS",
     "SIZES",
     "Adam",
     "Agent",
     "AgentConfig",
     "Architecture",
     "Behaviour",
+    "Disagreement",
     "DreamerV3",
     "EnvironmentGoals",
+    "ExplorationReward",
     "Flat",
     "FrameGoalSource",
+    "FullLatent",
+    "FullLatentCosine",
+    "FutureGoalSource",
     "Goal",
     "GoalEncoding",
     "GoalSource",
+    "ImageEmbedding",
     "ImaginedReward",
     "LatentChord",
     "LatentSimilarity",
@@ -52,6 +63,7 @@ __all__ = [
     "MixedGoalSource",
     "NoGoal",
     "ObjectCentric",
+    "ObjectEntropy",
     "ObjectLatent",
     "OptimizerPart",
     "Policy",
@@ -60,6 +72,8 @@ __all__ = [
     "Reward",
     "Scene",
     "Size",
+    "StateEntropy",
+    "TemporalDistance",
     "UniformGoalSource",
     "WorldModelPart",
     "agent_name",

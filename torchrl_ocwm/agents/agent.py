@@ -36,6 +36,7 @@ class Policy(TensorDictSequential):
         agent: The agent that it belongs to.
         behaviour: The behaviour.
         takes_images: Whether goals can be given as images.
+        takes_positions: Whether they can be given as positions.
     """
 
     def __init__(self, agent: Agent, behaviour: LearntBehaviour, *modules: TensorDictModuleBase) -> None:
@@ -48,6 +49,16 @@ class Policy(TensorDictSequential):
     def takes_images(self) -> bool:
         goal = self.behaviour.goal
         return goal is not None and goal.image is not None
+
+    @property
+    def object_index(self) -> int:
+        """Which of the task's objects it is to position."""
+        return self.behaviour.scene.object_index
+
+    @property
+    def takes_positions(self) -> bool:
+        goal = self.behaviour.goal
+        return goal is None or goal.position is not None
 
 
 class Agent(nn.Module):
@@ -62,6 +73,8 @@ class Agent(nn.Module):
         model: The world model.
         behaviours: What is learnt in it, by name.
         loss: All of it in one loss, as TorchRL's DreamerV3 stepper takes it.
+        recorded_object: Which object the goals and rewards of its training records are about
+            (:class:`~torchrl_ocwm.data.RelabelGoals`).
 
     Raises:
         SettingsError: if the choices do not fit together or an image of the task cannot be halved by the CNN.
@@ -76,6 +89,7 @@ class Agent(nn.Module):
         model_loss = config.world_model.loss(self.model, needs, lambda_dynamic=size.learning.lambda_dynamic)
         losses = {name: self.behaviour(name).loss for name in self.behaviours}
         self.loss = GoalConditionedDreamerLoss(model_loss, losses)
+        self.recorded_object = self._recorded_object()
 
     def behaviour(self, name: str | None = None) -> LearntBehaviour:
         """A behaviour by its name; without one, that which acts.
@@ -134,6 +148,17 @@ class Agent(nn.Module):
         scene = Scene(self.model, self.task, self.size.architecture, self._index(config.object))
         prefix = "" if name == self.config.acting else f"{name}_"
         return LearntBehaviour(config, scene, self.size.learning, prefix=prefix)
+
+    def _recorded_object(self) -> int:
+        """That of the behaviours which learn the rewards of the records, or else of the one that acts."""
+        learners = {name: one for name, one in self.config.behaviours.items() if "reward_head" in one.reward.needs}
+        objects = {name: self._index(one.object) for name, one in learners.items()}
+        if len(set(objects.values())) > 1:
+            raise SettingsError(
+                f"behaviours {', '.join(objects)} learn the rewards of the records, which are about one object; "
+                "they must not differ in object"
+            )
+        return next(iter(objects.values()), self.behaviour().scene.object_index)
 
     def _index(self, name: str | None) -> int:
         objects = self.task.objects

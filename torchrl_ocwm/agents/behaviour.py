@@ -18,7 +18,7 @@ from torchrl_ocwm.agents.config import Behaviour, Learning
 from torchrl_ocwm.agents.goals import GoalEncoding
 from torchrl_ocwm.agents.rewards import ImaginedReward
 from torchrl_ocwm.agents.scene import Scene
-from torchrl_ocwm.modules import Actor, ImaginationEnv
+from torchrl_ocwm.modules import Actor, ImaginationEnv, WorldModel
 from torchrl_ocwm.modules.goals import GOAL
 from torchrl_ocwm.modules.networks import make_mlp
 from torchrl_ocwm.objectives import BehaviourLoss
@@ -67,6 +67,11 @@ class LearntBehaviour(nn.Module):
         source = None if self.goal is None else config.goals.build(scene.model.units.dim, self.goal)
         self.reward_lr = reward.lr
         self.loss = self._make_loss(make_critic(scene, features), source, reward, learning, prefix)
+
+    @property
+    def model(self) -> WorldModel:
+        """The world model that it is learnt in."""
+        return self.scene.model
 
     def _make_loss(
         self,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from torchrl_ocwm.agents.config import AgentConfig, Size
 from torchrl_ocwm.agents.presets import flat
 from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.parts import VARIABLE, absent, foreign
 from torchrl_ocwm.settings import Settings, SettingsError, from_dict, to_dict
 
 
@@ -44,11 +46,12 @@ def save_agent(agent: Agent, path: str | Path) -> Path:
     return Archive(agent=describe(agent), loss_module=agent.loss).save(path)
 
 
-def load_agent(path: str | Path, *, device: torch.device | str = "cpu") -> Policy:
+def load_agent(path: str | Path, *, behaviour: str | None = None, device: torch.device | str = "cpu") -> Policy:
     """Load a trained agent's policy from a checkpoint; no dataset and no simulator is needed.
 
     Args:
         path: A checkpoint that training or :func:`save_agent` wrote.
+        behaviour: Which of the agent's behaviours acts; ``None``: that which acts unless another is asked for.
         device: Where to put it.
 
     Returns:
@@ -58,12 +61,13 @@ def load_agent(path: str | Path, *, device: torch.device | str = "cpu") -> Polic
     Raises:
         CheckpointError: if there is no checkpoint, a damaged one, or not one of an agent of this library.
         DeviceError: if there is no such device.
+        ValueError: if there is no such behaviour.
     """
     path, device = Path(path), usable_device(device)
     agent = rebuild(read_description(path))
     Archive(loss_module=agent.loss).load(path, map_location="cpu")
     agent.to(device).eval().requires_grad_(False)
-    return agent.policy()
+    return agent.policy(behaviour)
 
 
 @dataclass(frozen=True)
@@ -75,17 +79,24 @@ class Description(Settings):
         size: How large it is, and how it learns.
         task: What it is for.
         release: The release of this library that wrote it.
+        plugins: The parts of other packages in it, and the packages, to say what is missing.
     """
 
     agent: AgentConfig
     size: Size
     task: Task
     release: str
+    plugins: Mapping[str, str] = field(default_factory=dict)
 
 
 def describe(agent: Agent) -> dict[str, Any]:
-    """What it takes to build an agent again; fits in JSON."""
-    return to_dict(Description(agent.config, agent.size, agent.task, __version__))
+    """What it takes to build an agent again; fits in JSON.
+
+    Raises:
+        SettingsError: for a part that is not registered, and could not be built again.
+    """
+    plugins = {**foreign(agent.config), **foreign(agent.size)}
+    return to_dict(Description(agent.config, agent.size, agent.task, __version__, plugins))
 
 
 def rebuild(description: Any) -> Agent:
@@ -111,6 +122,11 @@ def read_parts(description: Any) -> Description:
     try:
         return from_dict(Description, description)
     except SettingsError as error:
+        if missing := absent(description.get("plugins") if isinstance(description, dict) else None):
+            raise CheckpointError(
+                f"the agent has parts that are not registered here: {', '.join(missing)}; install what registers them, "
+                f"or name it in {VARIABLE}"
+            ) from error
         if release == __version__:
             raise CheckpointError(f"the checkpoint is damaged: {error}") from error
         raise CheckpointError(

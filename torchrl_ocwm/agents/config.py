@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from torchrl_ocwm.agents.goal_sources import EnvironmentGoals, GoalSource
 from torchrl_ocwm.agents.goals import Goal, NoGoal
@@ -15,6 +15,8 @@ from torchrl_ocwm.settings import Settings, SettingsError, setting
 
 #: The behaviour that acts unless another is asked for.
 REACH = "reach"
+#: The behaviour that explores, where there is one.
+EXPLORE = "explore"
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,18 @@ class AgentConfig(Settings):
 
     Args:
         world_model: What observes, remembers and predicts.
-        behaviours: What is learnt in it; ``reach`` acts unless another is asked for.
+        behaviours: What is learnt in it, in the order of ``reach`` and then the other names; the first acts unless
+            another is asked for.
     """
 
     world_model: WorldModelPart = field(default_factory=Flat)
     behaviours: Mapping[str, Behaviour] = field(default_factory=lambda: {REACH: Behaviour()})
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        # A file does not keep an order; parameters and random numbers have to come in the same one.
+        names = sorted(self.behaviours, key=lambda name: (name != REACH, name))
+        object.__setattr__(self, "behaviours", {name: self.behaviours[name] for name in names})
 
     def validate(self) -> None:
         """There is something to learn, and names fit into those of losses."""
@@ -55,8 +64,18 @@ class AgentConfig(Settings):
 
     @property
     def acting(self) -> str:
-        """The behaviour that acts: ``reach``, or the first if there is none of this name."""
-        return REACH if REACH in self.behaviours else next(iter(self.behaviours))
+        """The behaviour that acts: ``reach``, or the first by name if there is none of this name."""
+        return next(iter(self.behaviours))
+
+    def and_behaviours(self, **behaviours: Behaviour) -> AgentConfig:
+        """The same row with more behaviours beside its own, by name.
+
+        Examples:
+            >>> from torchrl_ocwm.agents import AGENTS, EXPLORERS
+            >>> list(AGENTS["dreamer_pcp"].and_behaviours(explore=EXPLORERS["plan2explore"]).behaviours)
+            ['reach', 'explore']
+        """
+        return replace(self, behaviours={**self.behaviours, **behaviours})
 
 
 @dataclass(frozen=True, kw_only=True)

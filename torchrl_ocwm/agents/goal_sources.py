@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 
 from torchrl_ocwm.agents.goals import GoalEncoding
-from torchrl_ocwm.modules import FrameGoals, MixedGoals, UniformGoals
+from torchrl_ocwm.modules import FrameGoals, FutureGoals, MixedGoals, UniformGoals
 from torchrl_ocwm.modules.goals import GOAL
 from torchrl_ocwm.parts import Part, register
 from torchrl_ocwm.settings import SettingsError, setting
@@ -64,10 +64,12 @@ class UniformGoalSource(GoalSource):
 class FrameGoalSource(GoalSource):
     """Each imagined start gets what another frame of the batch shows."""
 
-    def build(self, dim: int, goal: GoalEncoding) -> TensorDictModuleBase:
+    def build(self, dim: int, goal: GoalEncoding) -> FrameGoals:
         """The goals that the frames are, shuffled."""
         del dim
-        return FrameGoals(goal.frame)
+        if goal.object_index is None:
+            return FrameGoals(goal.frame, object_visible=None)
+        return FrameGoals(goal.frame, object_index=goal.object_index)
 
 
 @register("mixed")
@@ -85,3 +87,21 @@ class MixedGoalSource(GoalSource):
         """One or the other for each start."""
         uniform, frames = UniformGoalSource().build(dim, goal), FrameGoalSource().build(dim, goal)
         return MixedGoals(uniform, frames, share=self.share)
+
+
+@register("future")
+@dataclass(frozen=True)
+class FutureGoalSource(GoalSource):
+    """Each imagined start gets what a later frame of its sequence shows, one that was reached from it (hindsight).
+
+    Args:
+        mean_offset: Mean number of frames until then, of a geometric distribution that ends with the sequence.
+        share: Share of these goals; the others are what random frames of the batch show.
+    """
+
+    mean_offset: float = setting(10.0, above=1)
+    share: float = setting(1.0, at_least=0, at_most=1)
+
+    def build(self, dim: int, goal: GoalEncoding) -> TensorDictModuleBase:
+        """The goals that later frames are."""
+        return FutureGoals(FrameGoalSource().build(dim, goal), mean_offset=self.mean_offset, share=self.share)

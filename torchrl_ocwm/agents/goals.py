@@ -11,7 +11,13 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_ocwm.agents.scene import Scene
-from torchrl_ocwm.modules import LatentPositionalEncoder, ObjectWorldModel, UnitRMS
+from torchrl_ocwm.modules import (
+    FlatWorldModel,
+    LatentPositionalEncoder,
+    ObjectWorldModel,
+    ObservationEncoder,
+    UnitRMS,
+)
 from torchrl_ocwm.modules.goals import GOAL
 from torchrl_ocwm.parts import Part, register
 from torchrl_ocwm.settings import SettingsError, setting
@@ -26,6 +32,7 @@ class GoalEncoding(NamedTuple):
         image: Encodes images ``[..., F, 3, H, W]`` uint8, if it can be done.
         frame: Writes ``("latent", "goal")``, the goal that a frame of the records is.
         directions: Whether only its direction means something; its length is then the same for all goals.
+        object_index: Which object has to be seen in a frame that is a goal; ``None``: every frame is one.
     """
 
     features: int
@@ -33,6 +40,7 @@ class GoalEncoding(NamedTuple):
     image: nn.Module | None
     frame: TensorDictModuleBase
     directions: bool = False
+    object_index: int | None = None
 
 
 class Goal(Part, kind="goal"):
@@ -60,19 +68,20 @@ class NoGoal(Goal):
 @register("position")
 @dataclass(frozen=True)
 class Position(Goal):
-    """They also see the goal position, in workspace units (paper, section PCP)."""
+    """Actor and critic also see the goal position, in workspace units (paper, section PCP)."""
 
     def build(self, scene: Scene) -> GoalEncoding:
         """The position as it is."""
         dim = scene.model.units.dim
         select = nn.Sequential(nn.Unflatten(-1, (-1, dim)), SelectObject(scene.object_index))
-        return GoalEncoding(dim, nn.Identity(), None, TensorDictModule(select, ["object_units"], [GOAL]))
+        frame = TensorDictModule(select, ["object_units"], [GOAL])
+        return GoalEncoding(dim, nn.Identity(), None, frame, object_index=scene.object_index)
 
 
 @register("object_latent")
 @dataclass(frozen=True)
 class ObjectLatent(Goal):
-    """They also see the latent that the object would have at the goal (paper, section LCP).
+    """Actor and critic also see the latent that the object would have at the goal (paper, section LCP).
 
     Positions and images are encoded by different networks, which are trained to agree in direction only. All goals are
     brought to one length here, so that an actor trained on the one kind knows the other. With ``distance="mse"``
@@ -106,7 +115,46 @@ class ObjectLatent(Goal):
         position = nn.Sequential(_LatentAtGoal(model.positional_encoder, index), length)
         image = nn.Sequential(model.latents_in_images(), SelectObject(index), length)
         frame = TensorDictModule(nn.Sequential(SelectObject(index), length), ["image_latent"], [GOAL])
-        return GoalEncoding(model.positional_encoder.features, position, image, frame, directions)
+        return GoalEncoding(model.positional_encoder.features, position, image, frame, directions, index)
+
+
+@register("full_latent")
+@dataclass(frozen=True)
+class FullLatent(Goal):
+    """They also see the latent of the whole scene, state and belief, that an image of the goal gives (LEXA cosine).
+
+    In training a frame is encoded as a goal image is when the agent acts: alone, as the first frame of an episode. The
+    latent that the world model has of the frame remembers what came before it, which no goal image does.
+
+    Args:
+        weight: Weight of the loss that teaches the world model what an image alone shows.
+    """
+
+    weight: float = setting(1.0, at_least=0)
+
+    @property
+    def needs(self) -> Mapping[str, Any]:
+        """Latents of images alone, and how they are trained."""
+        return {"image_latent": {"lambda_image_latent": self.weight}}
+
+    def build(self, scene: Scene) -> GoalEncoding:
+        """The latent of images, and that of the image of a frame."""
+        model = scene.model
+        assert isinstance(model, FlatWorldModel)  # no other gives what is needed
+        frame = TensorDictModule(nn.Identity(), ["image_latent"], [GOAL])
+        return GoalEncoding(model.latent_features, None, model.latent_in_images(), frame)
+
+
+@register("image_embedding")
+@dataclass(frozen=True)
+class ImageEmbedding(Goal):
+    """They also see what the world model's encoder makes of an image of the goal (LEXA temporal)."""
+
+    def build(self, scene: Scene) -> GoalEncoding:
+        """The image's part of the embedding; of several images, that of the last."""
+        encoder = scene.model.encoder
+        frame = TensorDictModule(_ImagePart(encoder), ["encoded_latents"], [GOAL])
+        return GoalEncoding(encoder.image_features, None, _LastImage(encoder), frame)
 
 
 def object_centric(model: nn.Module) -> ObjectWorldModel:
@@ -133,6 +181,28 @@ class SelectObject(nn.Module):
 
     def forward(self, objects: Tensor) -> Tensor:
         return objects[..., self.index, :]
+
+
+class _LastImage(nn.Module):
+    """Images ``[..., F, 3, H, W]`` to the embedding ``[..., E]`` of the last."""
+
+    def __init__(self, encoder: ObservationEncoder) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        return self.encoder.image(pixels[..., -1, :, :, :]).float()
+
+
+class _ImagePart(nn.Module):
+    """Embeddings of images and vectors to the image's part ``[..., E]``; holds no parameters of the encoder."""
+
+    def __init__(self, encoder: ObservationEncoder) -> None:
+        super().__init__()
+        self.features = encoder.image_features
+
+    def forward(self, embedding: Tensor) -> Tensor:
+        return embedding[..., : self.features].float()
 
 
 class _LatentAtGoal(nn.Module):

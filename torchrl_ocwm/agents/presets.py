@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from torchrl_ocwm.agents.config import REACH, AgentConfig, Behaviour, Learning, Size
-from torchrl_ocwm.agents.goal_sources import UniformGoalSource
-from torchrl_ocwm.agents.goals import ObjectLatent, Position
+from torchrl_ocwm.agents.config import EXPLORE, REACH, AgentConfig, Behaviour, Learning, Size
+from torchrl_ocwm.agents.explorers import Disagreement, ObjectEntropy, StateEntropy
+from torchrl_ocwm.agents.goal_sources import FrameGoalSource, UniformGoalSource
+from torchrl_ocwm.agents.goals import FullLatent, ImageEmbedding, ObjectLatent, Position
 from torchrl_ocwm.agents.optimizers import Adam, DreamerV3
-from torchrl_ocwm.agents.rewards import LatentChord, PositionDistance
+from torchrl_ocwm.agents.rewards import FullLatentCosine, LatentChord, PositionDistance, TemporalDistance
 from torchrl_ocwm.agents.world_models import Flat, ObjectCentric
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.world_model import VectorName
@@ -19,6 +20,13 @@ _WITH_GOAL: tuple[VectorName, ...] = ("proprio", "object_position", "goal_positi
 _PCP = Behaviour(goal=Position(), reward=PositionDistance(), goals=UniformGoalSource())
 _LCP = Behaviour(goal=ObjectLatent(weight=100.0), reward=LatentChord(), goals=UniformGoalSource())
 
+#: Behaviours that explore, for any row (``explore=`` on the command line). Add one of your own under a new name.
+EXPLORERS = {
+    "plan2explore": Behaviour(reward=Disagreement()),
+    "focus_explore": Behaviour(reward=ObjectEntropy()),
+    "apt": Behaviour(reward=StateEntropy()),
+}
+
 #: The rows. Add one of your own under a new name, and it can be built, trained and loaded by it.
 AGENTS = {
     "dreamer": AgentConfig(Flat(observed=_WITH_GOAL)),
@@ -26,6 +34,10 @@ AGENTS = {
     "focus": AgentConfig(ObjectCentric(observed=_WITH_GOAL)),
     "focus_pcp": AgentConfig(ObjectCentric(), {REACH: _PCP}),
     "focus_lcp": AgentConfig(ObjectCentric(), {REACH: _LCP}),
+    "lexa_cosine": AgentConfig(Flat(), {REACH: Behaviour(FullLatent(), FullLatentCosine(), FrameGoalSource())}),
+    "lexa_temporal": AgentConfig(Flat(), {REACH: Behaviour(ImageEmbedding(), TemporalDistance(), FrameGoalSource())}),
+    "plan2explore": AgentConfig(Flat(), {EXPLORE: EXPLORERS["plan2explore"]}),
+    "focus_explore": AgentConfig(ObjectCentric(), {EXPLORE: EXPLORERS["focus_explore"]}),
 }
 
 # fmt: off
@@ -84,14 +96,20 @@ SIZES = {
 
 
 def agent_name(config: AgentConfig) -> str:
-    """Name of a row of choices: that of the nearest preset, and in what it differs.
+    """Name of a row of choices: that of the nearest preset and of an explorer beside it, and in what it differs.
 
     Examples:
         >>> agent_name(AgentConfig(Flat(observed=("proprio", "object_position", "goal_position"), lambda_proprio=2.0)))
         'dreamer (world_model.lambda_proprio=2.0)'
+        >>> agent_name(AGENTS["focus_lcp"].and_behaviours(explore=EXPLORERS["apt"]))
+        'focus_lcp + apt'
     """
+    names = dict(AGENTS)
+    for agent, preset in AGENTS.items():
+        if EXPLORE not in preset.behaviours:
+            names.update({f"{agent} + {name}": preset.and_behaviours(explore=one) for name, one in EXPLORERS.items()})
     here = flat(to_dict(config))
-    differences = {name: _difference(here, flat(to_dict(preset))) for name, preset in AGENTS.items()}
+    differences = {name: _difference(here, flat(to_dict(preset))) for name, preset in names.items()}
     nearest = min(differences, key=lambda name: len(differences[name]))
     changed = ", ".join(f"{key}={value}" for key, value in differences[nearest].items())
     return f"{nearest} ({changed})" if changed else nearest

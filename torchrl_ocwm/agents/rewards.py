@@ -7,14 +7,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torchrl.objectives import LossModule
 
 from torchrl_ocwm.agents.goals import GoalEncoding, object_centric
 from torchrl_ocwm.agents.scene import Scene
-from torchrl_ocwm.modules import LatentSimilarityReward, PositionDistanceReward
+from torchrl_ocwm.modules import (
+    FullLatentReward,
+    LatentSimilarityReward,
+    PositionDistanceReward,
+    TemporalDistanceReward,
+)
+from torchrl_ocwm.modules import TemporalDistance as DistanceNetwork
+from torchrl_ocwm.modules.networks import make_mlp
+from torchrl_ocwm.objectives import TemporalDistanceLoss
 from torchrl_ocwm.parts import Part, register
-from torchrl_ocwm.settings import SettingsError
+from torchrl_ocwm.settings import SettingsError, setting
 
 
 class ImaginedReward(NamedTuple):
@@ -102,6 +110,54 @@ class LatentChord(Reward):
     def build(self, scene: Scene, goal: GoalEncoding | None) -> ImaginedReward:
         """The chord, from the extracted latents."""
         return _on_object_latent(scene, "chord")
+
+
+@register("full_latent_cosine")
+@dataclass(frozen=True)
+class FullLatentCosine(Reward):
+    """Cosine similarity of the latent of the whole scene and the goal latent (LEXA cosine)."""
+
+    def build(self, scene: Scene, goal: GoalEncoding | None) -> ImaginedReward:
+        """The similarity."""
+        if goal is not None and goal.features != scene.model.latent_features:
+            raise SettingsError("reward='full_latent_cosine' compares whole latents: it needs goal='full_latent'")
+        return ImaginedReward(FullLatentReward())
+
+
+@register("temporal_distance")
+@dataclass(frozen=True)
+class TemporalDistance(Reward):
+    """Minus the learnt number of steps from the state to the goal, as a share of the horizon (LEXA temporal).
+
+    A head learns to predict, from the latent of a frame, the goal that this frame would be. A network learns, from the
+    head's predictions along the behaviour's own imagined rollouts, how many steps apart two of them are. The defaults
+    are those of the paper; LEXA's release has 4 layers of 128 units with batch normalisation.
+
+    Args:
+        layers: Hidden layers of the network.
+        units: Units of each.
+        batch_norm: Whether they are normalised over the batch.
+        positives: Pairs of points of one rollout that the network learns from, per update.
+        negatives: Pairs of points of different sequences, which count as a whole horizon apart, as a share of these.
+        lr: Learning rate of head and network; ``None``: that of the world model.
+    """
+
+    layers: int = setting(4, at_least=1)
+    units: int = setting(400, at_least=1)
+    batch_norm: bool = False
+    positives: int = setting(256, at_least=1)
+    negatives: float = setting(0.1, at_least=0)
+    lr: float | None = setting(None, at_least=0)
+
+    def build(self, scene: Scene, goal: GoalEncoding | None) -> ImaginedReward:
+        """The distance, and the loss that teaches it."""
+        if goal is None:
+            raise SettingsError("reward='temporal_distance' is a distance to a goal; give the behaviour one")
+        head = make_mlp(in_features=scene.model.latent_features, out_features=goal.features, **scene.architecture.mlp)
+        network = DistanceNetwork(goal.features, layers=self.layers, units=self.units, batch_norm=self.batch_norm)
+        loss = TemporalDistanceLoss(head, network, goal.frame, positives=self.positives, negatives=self.negatives)
+        predict = TensorDictModule(head, [("latent", "state"), ("latent", "belief")], ["embedding"])
+        return ImaginedReward(TensorDictSequential(predict, TemporalDistanceReward(network)), loss, self.lr)
 
 
 def _on_object_latent(scene: Scene, distance: Literal["cosine", "mse", "chord"]) -> ImaginedReward:

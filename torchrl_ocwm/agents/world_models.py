@@ -61,7 +61,7 @@ class _Observing(WorldModelPart):
                 raise SettingsError(f"{one.name} does nothing: {name!r} is not in observed={self.observed}")
 
     def _arguments(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> dict[str, Any]:
-        known = {"reward_head"} | ({"positional_encoder"} if isinstance(self, ObjectCentric) else set())
+        known = {"reward_head", "positional_encoder" if isinstance(self, ObjectCentric) else "image_latent"}
         if odd := sorted(set(needs) - known):
             raise SettingsError(f"world_model={self._name!r} has no {odd[0]}, which a goal or a reward needs")
         return {
@@ -86,13 +86,12 @@ class Flat(_Observing):
     """One latent state for the whole scene (Dreamer)."""
 
     def build(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> FlatWorldModel:
-        """A world model with one latent."""
-        return FlatWorldModel(**self._arguments(task, architecture, needs))
+        """A world model with one latent, which learns the latents of images alone if a goal needs them."""
+        return FlatWorldModel(**self._arguments(task, architecture, needs), image_latent="image_latent" in needs)
 
     def loss(self, model: WorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> WorldModelLoss:
         """What trains it."""
-        del needs
-        return WorldModelLoss(model.records(), **self._weights(lambda_dynamic))
+        return WorldModelLoss(model.records(), **needs.get("image_latent", {}), **self._weights(lambda_dynamic))
 
 
 @register("object")

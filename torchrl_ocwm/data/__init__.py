@@ -1,6 +1,6 @@
 """What is kept: collect, store, load, slice."""
 
-from torchrl_ocwm.data.coverage import Coverage, dataset_coverage, object_coverage
+from torchrl_ocwm.data.coverage import Coverage, coverage_curve, dataset_coverage, object_coverage, object_positions
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
 from torchrl_ocwm.data.memory import release_pages
 from torchrl_ocwm.data.policies import ScriptedPolicy, SmoothRandomPolicy
@@ -15,9 +15,11 @@ __all__ = [
     "RelabelGoals",
     "ScriptedPolicy",
     "SmoothRandomPolicy",
+    "coverage_curve",
     "dataset_coverage",
     "episode_to_records",
     "make_replay_buffer",
     "object_coverage",
+    "object_positions",
     "release_pages",
 ]

@@ -26,7 +26,7 @@ from torchrl_ocwm.data.policies import ScriptedPolicy, SmoothRandomPolicy
 from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
 from torchrl_ocwm.data.settings import Collection
-from torchrl_ocwm.envs import ScriptedAction, Task, make_env, make_task
+from torchrl_ocwm.envs import ScriptedAction, Task, find_environment, make_env, make_task
 from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.processes import Make, Worker, make_worker
@@ -117,16 +117,19 @@ def collect(
         settings = Collection(steps=settings, **more)
     options = options or {}
     task = make_task(environment, **options)
-    source = {"environment": environment, "options": options, "task": task.to_dict()}
-    name, module = make_policy(settings.policy if policy is None else policy, task)
+    source = {"environment": task.name, "options": options, "task": task.to_dict()}
+    name, module = make_policy(settings.policy if policy is None else policy, task, settings.behaviour)
     dataset = _open_if_there(Path(path), source)
     if dataset is not None and dataset.num_steps >= settings.steps:
         with dataset:
-            return _with_coverage(dataset, task)
+            return with_coverage(dataset, task)
     done = dataset.num_steps if dataset is not None else 0
 
     make_player = partial(
-        EpisodePlayer, partial(make_env, environment, **{**options, "privileged": True}), module, settings.seed
+        EpisodePlayer,
+        partial(make_env, find_environment(environment), **{**options, "privileged": True}),
+        module,
+        settings.seed,
     )
     played = play_in_order(make_player, settings, first=_next_number(dataset))
     bar = tqdm(total=settings.steps, initial=done, unit="step", desc=f"collect {environment}", disable=not progress)
@@ -136,19 +139,21 @@ def collect(
         for records, failures in episodes:
             if dataset is None:
                 dataset = writing.enter_context(EpisodeDataset.create(path, example=records[0], metadata=source))
-            dataset.append(records, **_count(dataset, name, failures), coverage=None)
+            dataset.append(records, **count_episode(dataset, name, failures), coverage=None)
             bar.update(len(records) - 1)
             if dataset.num_steps >= settings.steps:
                 break
         assert dataset is not None
-        return _with_coverage(dataset, task)
+        return with_coverage(dataset, task)
 
 
-def make_policy(policy: str | Path | TensorDictModuleBase, task: Task) -> tuple[str, TensorDictModuleBase]:
-    """A policy's name in the index of a dataset, and the module that acts.
+def make_policy(
+    policy: str | Path | TensorDictModuleBase, task: Task, behaviour: str | None = None
+) -> tuple[str, TensorDictModuleBase]:
+    """A policy's name in the index of a dataset, and the module that acts: of an agent, one of its behaviours.
 
     Raises:
-        SettingsError: for an unknown name, or a checkpoint of another task's agent.
+        SettingsError: for an unknown name, a checkpoint of another task's agent, or a behaviour that it does not have.
         CheckpointError: for a file that is no checkpoint of an agent.
     """
     if isinstance(policy, TensorDictModuleBase):
@@ -157,13 +162,13 @@ def make_policy(policy: str | Path | TensorDictModuleBase, task: Task) -> tuple[
         return str(policy), POLICIES[str(policy)](task.action)
     if not Path(policy).is_file():
         raise SettingsError(f"policy must be {', '.join(POLICIES)} or a checkpoint file, got {str(policy)!r}")
-    loaded = load_agent(policy)
+    loaded = load_agent(policy, behaviour=behaviour)
     if loaded.agent.task != task:
         raise SettingsError(
             f"policy={policy}: the agent was trained for {loaded.agent.task.name!r} with options "
             f"{loaded.agent.task.options}, not for {task.name!r} with {task.options}"
         )
-    return str(policy), loaded
+    return f"{policy} ({behaviour})" if behaviour else str(policy), loaded
 
 
 class EpisodePlayer:
@@ -234,7 +239,7 @@ def play_in_order(
                 episode = players[turn].answer()
             except RuntimeError as error:  # of the simulator, or of a process that died or hangs
                 failures += 1
-                _check_failures(failures, error)
+                check_failures(failures, error)
                 players[turn].close()
                 players[turn] = begin()
                 players[turn].ready()
@@ -247,7 +252,8 @@ def play_in_order(
             player.close()
 
 
-def _check_failures(failures: int, error: RuntimeError) -> None:
+def check_failures(failures: int, error: RuntimeError) -> None:
+    """Warn of an episode that failed, or raise if too many did so in a row."""
     if isinstance(error, NotImplementedError):
         raise error
     if failures > MAX_FAILURES:
@@ -261,14 +267,15 @@ def _next_number(dataset: EpisodeDataset | None) -> int:
     return 0 if dataset is None else len(dataset.episode_lengths) + dataset.metadata.get("failures", 0)
 
 
-def _count(dataset: EpisodeDataset, policy: str, failures: int) -> dict[str, Any]:
+def count_episode(dataset: EpisodeDataset, policy: str, failures: int) -> dict[str, Any]:
     """The index's counts with one more episode."""
     counts = Counter(dataset.metadata.get("policies", {}))
     counts[policy] += 1
     return {"policies": dict(counts), "failures": dataset.metadata.get("failures", 0) + failures}
 
 
-def _with_coverage(dataset: EpisodeDataset, task: Task) -> EpisodeDataset:
+def with_coverage(dataset: EpisodeDataset, task: Task) -> EpisodeDataset:
+    """The dataset, which is open for writing, with the coverage of its episodes in its index."""
     if dataset.metadata.get("coverage") is None:
         coverage = dataset_coverage(dataset, task.objects, task.workspace)
         dataset.annotate(coverage={name: seen._asdict() for name, seen in coverage.items()})

@@ -51,10 +51,46 @@ def object_coverage(
     return Coverage((distance[within] > _MOVED).float().mean().item(), visited / len(centres))
 
 
-def dataset_coverage(dataset: EpisodeDataset, objects: tuple[str, ...], workspace: Workspace) -> dict[str, Coverage]:
-    """Coverage of each object of a dataset, from the simulator's positions, or from estimates where there are none."""
+def coverage_curve(
+    positions: Tensor, episode_lengths: list[int], workspace: Workspace, *, points: int = 20, cells: int = 10
+) -> dict[int, Coverage]:
+    """Coverage of the first episodes of a dataset, of more and more of them.
+
+    Args:
+        positions: As for :func:`object_coverage`.
+        episode_lengths: Frames of each episode.
+        workspace: Where goals are.
+        points: How many, evenly spread over the episodes.
+        cells: As for :func:`object_coverage`.
+
+    Returns:
+        Environment steps so far → coverage so far.
+
+    Examples:
+        >>> square = Workspace(low=(-1.0, -1.0), high=(1.0, 1.0))
+        >>> path = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [0.5, -0.5], [0.5, 0.5]])
+        >>> coverage_curve(path, [2, 2], square, points=2, cells=2)
+        {1: Coverage(moves=1.0, visited=0.5), 2: Coverage(moves=1.0, visited=0.75)}
+    """
+    ends = torch.tensor(episode_lengths).cumsum(0).tolist()
+    counts = sorted({max(len(ends) * point // points, 1) for point in range(1, points + 1)})
+    return {
+        ends[count - 1] - count: object_coverage(
+            positions[: ends[count - 1]], episode_lengths[:count], workspace, cells=cells
+        )
+        for count in counts
+    }
+
+
+def object_positions(dataset: EpisodeDataset) -> Tensor:
+    """Positions ``[N, O, D]`` metres of a dataset: the simulator's, or estimates where there are none."""
     keys = dataset.records["next"].keys()
-    positions = dataset.records["next", "object_position_true" if "object_position_true" in keys else "object_position"]
+    return dataset.records["next", "object_position_true" if "object_position_true" in keys else "object_position"]
+
+
+def dataset_coverage(dataset: EpisodeDataset, objects: tuple[str, ...], workspace: Workspace) -> dict[str, Coverage]:
+    """Coverage of each object of a dataset, from :func:`object_positions`."""
+    positions = object_positions(dataset)
     return {
         name: object_coverage(positions[:, number].clone(), dataset.episode_lengths, workspace)
         for number, name in enumerate(objects)

@@ -6,7 +6,7 @@ from hashlib import sha256
 from typing import Literal
 
 
-def episode_seed(purpose: Literal["collect", "evaluate", "imagine"], seed: int, number: int) -> int:
+def episode_seed(purpose: Literal["collect", "train", "evaluate", "imagine"], seed: int, number: int) -> int:
     """The seed of one episode's random numbers, the same whoever plays it and whatever was played before.
 
     Args:

@@ -12,8 +12,17 @@ if find_spec("mujoco") is not None:
     import_mujoco()  # TorchRL imports it too, and would fail without saying what is missing
 
 from torchrl_ocwm.envs.goal_env import GoalEnv
+from torchrl_ocwm.envs.options import EnvOptions
 from torchrl_ocwm.envs.positions import MaskToPosition, hold_last_seen, mask_centroid, masks_to_positions
-from torchrl_ocwm.envs.registry import ENVIRONMENTS, make_env, make_task
+from torchrl_ocwm.envs.registry import (
+    ENVIRONMENTS,
+    EnvChoice,
+    find_environment,
+    make_env,
+    make_scene,
+    make_task,
+    register_environment,
+)
 from torchrl_ocwm.envs.scripted import ScriptedAction
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.envs.workspace import Workspace
@@ -29,6 +38,8 @@ __all__ = [
     "ENVIRONMENTS",
     "Camera",
     "CubeMove",
+    "EnvChoice",
+    "EnvOptions",
     "Frame",
     "GoalEnv",
     "MaskToPosition",
@@ -40,11 +51,14 @@ __all__ = [
     "SimulationDivergedError",
     "Task",
     "Workspace",
+    "find_environment",
     "hold_last_seen",
     "make_env",
+    "make_scene",
     "make_task",
     "mask_centroid",
     "masks_to_positions",
+    "register_environment",
 ]
 
 # These need a simulator, so they are imported when they are asked for.
@@ -58,12 +72,6 @@ _LAZY = {
     "ShelfPlace": "meta_world",
     "SimulationDivergedError": "positioning",
 }
-
-if find_spec("gymnasium") is not None:
-    import gymnasium
-
-    for _environment in ENVIRONMENTS.values():
-        gymnasium.register(id=_environment.id, entry_point=_environment.entry_point)
 
 
 def __getattr__(name: str) -> Any:

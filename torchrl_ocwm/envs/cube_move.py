@@ -69,8 +69,8 @@ class CubeMove(PositioningEnv):
     6 cm beyond the workspace on the side away from the robot, and further on the others. Positions come from the depth
     at the mask, so that they also hold for a cube in the air.
 
-    Goal observations show the arm in its rest pose, where it hides no place of the workspace, and the cube upright on
-    the table with its sides along the axes. A distractor stays where it is.
+    Goal observations show the arm in its rest pose, where it hides no place of the workspace, and the cube (or, if
+    asked for, the distractor) upright on the table with its sides along the axes. The other one stays where it is.
 
     Args:
         objects: ``("cube",)``, or ``("cube", "distractor")`` for a second, blue cube that starts within 15 cm of the
@@ -133,7 +133,7 @@ class CubeMove(PositioningEnv):
         self._fingers = [joint.qposadr[0] for joint in fingers]
         self._finger_velocity = fingers[0].dofadr[0]
         self._gripper = model.site("gripper0_right_grip_site").id
-        self._cube = model.joint("cube_joint0").qposadr[0]
+        self._joints = [model.joint(f"{name}_joint0").qposadr[0] for name in self.objects]
         return model, data
 
     def _close_simulator(self) -> None:
@@ -159,12 +159,13 @@ class CubeMove(PositioningEnv):
     def _true_position(self, data: mujoco.MjData) -> np.ndarray:
         return data.geom_xpos[[ids[0] for ids in self._geom_ids]]
 
-    def _teleport(self, data: mujoco.MjData, position: np.ndarray) -> None:
+    def _teleport(self, data: mujoco.MjData, position: np.ndarray, object_index: int) -> None:
         robot = self._suite.robots[0]
         data.qpos[self._arm] = robot.init_qpos
         data.qpos[self._fingers] = robot.gripper["right"].init_qpos
-        height = _TABLE + self.model.geom_size[self._geom_ids[0][0], 2]
-        data.qpos[self._cube : self._cube + 7] = *(self._start[:2] + position), height, 1, 0, 0, 0
+        height = _TABLE + self.model.geom_size[self._geom_ids[object_index][0], 2]
+        joint = self._joints[object_index]
+        data.qpos[joint : joint + 7] = *(self._start[:2] + position), height, 1, 0, 0, 0
         data.qvel[:] = 0
 
     def _scripted_action(self, goal: np.ndarray, error: np.ndarray) -> np.ndarray:

@@ -103,7 +103,7 @@ class _MetaWorld(PositioningEnv):
     def _true_position(self, data: mujoco.MjData) -> np.ndarray:
         return data.xpos[[self._object]]
 
-    def _teleport(self, data: mujoco.MjData, position: np.ndarray) -> None:
+    def _teleport(self, data: mujoco.MjData, position: np.ndarray, object_index: int) -> None:  # noqa: ARG002
         # The arm has a joint to spare: from the same pose each time, its pose depends on the goal alone.
         mujoco.mj_resetData(self.model, data)
         place = self._world(position)

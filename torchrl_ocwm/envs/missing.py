@@ -16,8 +16,8 @@ class SystemLibraryError(UserError, ImportError):
 
 
 def missing(what: str, module: str, extra: str) -> MissingPackageError:
-    """What to install where ``module`` is missing, on one line."""
-    remedy = f"pip install 'torchrl-ocwm[{extra}]'"
+    """What to install where ``module`` is missing, on one line: an extra of this package, or a package of its name."""
+    remedy = f"pip install 'torchrl-ocwm[{extra}]'" if extra else f"pip install {module}"
     if module.split(".")[0] in _NOT_FOR_3_13 and sys.version_info >= (3, 13):
         remedy = "there is none for Python 3.13 and newer; use 3.10, 3.11 or 3.12"
     return MissingPackageError(f"{what} needs {module}, which is not installed: {remedy}", name=module)

@@ -46,7 +46,8 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     value, for tests and evaluation.
 
     The reward is −‖p − p_g‖₂ in metres (paper, equation 1) of the first object; ``info["success"]`` says whether it is
-    within 5 cm. Episodes are truncated after ``horizon`` steps and never terminate. The start of an episode depends on
+    within 5 cm. An agent may be about another one, with rewards of its own (:class:`~torchrl_ocwm.data.RelabelGoals`).
+    Episodes are truncated after ``horizon`` steps and never terminate. The start of an episode depends on
     nothing but the seed given at its reset.
 
     A suite adds an environment by filling in the class attributes and the six abstract methods.
@@ -149,8 +150,8 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         """World positions of the objects, (O, 3), metres."""
 
     @abstractmethod
-    def _teleport(self, data: mujoco.MjData, position: np.ndarray) -> None:
-        """Put the first object of ``data`` at a position (D,), metres from the start, or as near as can be."""
+    def _teleport(self, data: mujoco.MjData, position: np.ndarray, object_index: int) -> None:
+        """Put an object of ``data`` at a position (D,), metres from the start, or as near as can be."""
 
     def _close_simulator(self) -> None:
         """Let go of whatever else holds the model and its data, so that their memory is free at once."""
@@ -246,24 +247,29 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
 
     # Goals and observations.
 
-    def goal_observation(self, goal_position: np.ndarray) -> Observation:
-        """What would be seen with the first object at a goal; the running episode is not touched.
+    def goal_observation(self, goal_position: np.ndarray, object_index: int = 0) -> Observation:
+        """What would be seen with an object at a goal; the running episode is not touched.
 
         Args:
             goal_position: (D,) metres. Where the robot cannot reach it, the nearest reachable position is shown.
+            object_index: Which object; the others stay where they are.
 
         Returns:
             An observation with the keys of the environment, ``goal_position`` set to the goal.
         """
         self._check_open()
         goal = self._check_goal(goal_position)
+        if not 0 <= object_index < len(self.objects):
+            raise ValueError(
+                f"object_index must be below {len(self.objects)}, the number of objects; got {object_index}"
+            )
         if self._scratch is None:
             self._scratch = mujoco.MjData(self.model)
         full = mujoco.mjtState.mjSTATE_INTEGRATION
         state = np.empty(mujoco.mj_stateSize(self.model, full))
         mujoco.mj_getState(self.model, self.data, state, full)
         mujoco.mj_setState(self.model, self._scratch, state, full)
-        self._teleport(self._scratch, goal)
+        self._teleport(self._scratch, goal, object_index)
         mujoco.mj_forward(self.model, self._scratch)
         return self._observe(self._scratch, goal=goal)
 
@@ -307,7 +313,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         seen = visible.numpy()
         estimate = self._relative(world.numpy())
         observation = {
-            "pixels": self._paint_target(frame.pixels, masks[0], goal, data).transpose(2, 0, 1),
+            "pixels": self._paint_target(frame.pixels, masks.any(0), goal, data).transpose(2, 0, 1),
             "masks": masks.copy(),
             "proprio": self._proprio(data).astype(np.float32),
             "object_position": estimate if seen.all() else np.where(seen[:, None], estimate, self._last_seen),
@@ -338,7 +344,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         return math.dist(observation["object_position"][0], observation["goal_position"])
 
     def _paint_target(
-        self, pixels: np.ndarray, entity: np.ndarray, goal: np.ndarray, data: mujoco.MjData
+        self, pixels: np.ndarray, objects: np.ndarray, goal: np.ndarray, data: mujoco.MjData
     ) -> np.ndarray:
         if not self.virtual_target:
             return pixels
@@ -346,7 +352,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         centres = np.arange(self.image_size) + 0.5
         distance = np.hypot(centres[None] - column, centres[:, None] - row)
         disc = (distance <= self.virtual_target / 2) | (distance == distance.min())
-        pixels[disc & ~entity] = TARGET_COLOUR
+        pixels[disc & ~objects] = TARGET_COLOUR
         return pixels
 
     def project(self, position: np.ndarray) -> np.ndarray:

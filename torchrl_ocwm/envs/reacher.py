@@ -88,7 +88,7 @@ class Reacher(PositioningEnv):
     def _true_position(self, data: mujoco.MjData) -> np.ndarray:
         return data.geom_xpos[self._geom_ids[0]]
 
-    def _teleport(self, data: mujoco.MjData, position: np.ndarray) -> None:
+    def _teleport(self, data: mujoco.MjData, position: np.ndarray, object_index: int) -> None:  # noqa: ARG002
         data.qpos[:] = _joint_angles(position)
         data.qvel[:] = 0
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,6 +17,7 @@ from torchrl_ocwm.envs.goal_env import GoalEnv
 from torchrl_ocwm.envs.missing import missing
 from torchrl_ocwm.envs.options import CubeMoveOptions, EnvOptions, MetaWorldOptions
 from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.parts import VARIABLE, load_plugins
 from torchrl_ocwm.settings import Settings, SettingsError, from_dict
 
 
@@ -23,33 +25,79 @@ class Environment(NamedTuple):
     """One row.
 
     Args:
+        name: Its short name.
         id: Its gymnasium id.
-        entry_point: Where its class is, ``module:Class``.
-        extra: What installs its simulator; none: nothing has to be installed.
-        module: What is there when that is installed.
+        entry_point: Where its class is, ``module:Class``, or the class.
         options: What can be chosen of it.
+        modules: What has to be installed, beside gymnasium.
+        extra: The extra of this package that installs them; none: a package of their names does.
     """
 
+    name: str
     id: str
-    entry_point: str
+    entry_point: str | Callable[..., Any]
+    options: type[Settings] = EnvOptions
+    modules: tuple[str, ...] = ()
     extra: str = ""
-    module: str = "gymnasium"
-    options: type[EnvOptions] = EnvOptions
 
 
-#: Short name → environment.
-ENVIRONMENTS = {
-    "reacher": Environment("ocwm/Reacher-v0", "torchrl_ocwm.envs.reacher:Reacher", "dm-control", "dm_control"),
-    "cube_move": Environment(
-        "ocwm/CubeMove-v0", "torchrl_ocwm.envs.cube_move:CubeMove", "robosuite", "robosuite", CubeMoveOptions
-    ),
-    "shelf_place": Environment(
-        "ocwm/ShelfPlace-v0", "torchrl_ocwm.envs.meta_world:ShelfPlace", "metaworld", "metaworld", MetaWorldOptions
-    ),
-    "pick_place": Environment(
-        "ocwm/PickPlace-v0", "torchrl_ocwm.envs.meta_world:PickPlace", "metaworld", "metaworld", MetaWorldOptions
-    ),
-}
+#: Short name → environment; see :func:`register_environment`.
+ENVIRONMENTS: dict[str, Environment] = {}
+
+
+def register_environment(
+    name: str,
+    entry_point: str | Callable[..., Any],
+    *,
+    options: type[Settings] = EnvOptions,
+    modules: tuple[str, ...] = (),
+    extra: str = "",
+) -> Environment:
+    """Register an environment under a short name, by which command lines, datasets and checkpoints call it.
+
+    Args:
+        name: The name, such as ``cube_move``; its gymnasium id is then ``ocwm/CubeMove-v0``.
+        entry_point: Its class, or ``module:Class``, which is imported when it is needed: a
+            :class:`~torchrl_ocwm.envs.PositioningEnv`, or an environment with its keys and methods (docs/howto.md).
+        options: What can be chosen of it, as a settings class.
+        modules: What has to be installed, beside gymnasium.
+        extra: The extra of this package that installs them; none: a package of their names does.
+
+    Raises:
+        ValueError: for a name that another class has, and for what is no name or no ``module:Class``.
+
+    Examples:
+        >>> register_environment("reacher", "my_package:Reacher")
+        Traceback (most recent call last):
+        ValueError: the environment 'reacher' is registered already, as torchrl_ocwm.envs.reacher:Reacher
+    """
+    if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name):
+        raise ValueError(f"an environment has a name like 'cube_move', got {name!r}")
+    if isinstance(entry_point, str) and not re.fullmatch(r"\w+(\.\w+)*:\w+", entry_point):
+        raise ValueError(f"environment {name!r}: entry_point must be a class or 'module:Class', got {entry_point!r}")
+    there = ENVIRONMENTS.get(name)
+    if there is not None and _place(there.entry_point) != _place(entry_point):
+        raise ValueError(f"the environment {name!r} is registered already, as {_place(there.entry_point)}")
+    camel = "".join(word.capitalize() for word in name.split("_"))
+    environment = Environment(name, f"ocwm/{camel}-v0", entry_point, options, modules, extra)
+    ENVIRONMENTS[name] = environment
+    _tell_gymnasium(environment)
+    return environment
+
+
+def find_environment(name: str) -> Environment:
+    """The environment of a short name or gymnasium id, those of plugins too.
+
+    Raises:
+        SettingsError: for an unknown name, with those that there are.
+    """
+    found = _look_up(name)
+    if found is None:
+        raise SettingsError(
+            f"unknown environment {name!r}; there are {', '.join(ENVIRONMENTS)}, and those of packages that "
+            f"{VARIABLE} names"
+        )
+    return found
 
 
 @dataclass(frozen=True)
@@ -74,13 +122,14 @@ class EnvChoice(Settings):
 
     def validate(self) -> None:
         """Options are those of the environment."""
-        if self.name not in ENVIRONMENTS:
+        environment = _look_up(self.name)
+        if environment is None:
             raise SettingsError(f"name must be one of {', '.join(ENVIRONMENTS)}, got {self.name!r}")
-        from_dict(ENVIRONMENTS[self.name].options, self.options, "options")
+        from_dict(environment.options, self.options, "options")
 
 
 def make_env(
-    name: str,
+    name: str | Environment,
     *,
     num_envs: int = 1,
     seed: int | None = None,
@@ -90,7 +139,8 @@ def make_env(
     """Make an environment for TorchRL's collectors and rollouts.
 
     Args:
-        name: A short name or gymnasium id of :data:`ENVIRONMENTS`.
+        name: A short name or gymnasium id of :data:`ENVIRONMENTS`, or what :func:`find_environment` gives for it: other
+            processes need not have registered it then.
         num_envs: With more than one, that many processes step in parallel (:class:`~torchrl.envs.ParallelEnv`).
         seed: Seeds the environments, each differently.
         device: Where observations are put.
@@ -111,7 +161,8 @@ def make_env(
         torch.Size([3, 1, 2])
         >>> env.close()
     """
-    environment = _find(name)
+    environment = name if isinstance(name, Environment) else find_environment(name)
+    _check_installed(environment)
     if num_envs < 1:
         raise ValueError(f"num_envs must be at least 1, got {num_envs}")
     make = partial(_make_one, environment, device=device, **options)
@@ -128,36 +179,87 @@ def make_task(name: str, **options: Any) -> Task:
         >>> make_task("reacher").objects
         ('finger',)
     """
-    import gymnasium
-
-    import torchrl_ocwm.envs  # noqa: F401  (registers the ids)
-
-    with closing(gymnasium.make(_find(name).id, **options)) as env:
-        space: Any = env.observation_space
-        task: Any = env.unwrapped
+    environment = find_environment(name)
+    with closing(make_scene(environment, **options)) as scene:
+        space = scene.observation_space
         return Task(
-            name=name,
+            name=environment.name,
             image_size=space["pixels"].shape[-1],
-            objects=tuple(task.objects),
+            objects=tuple(scene.objects),
             proprio=space["proprio"].shape[0],
-            action=task.action_space.shape[0],
-            workspace=task.workspace,
+            action=scene.action_space.shape[0],
+            workspace=scene.workspace,
             options={key: value for key, value in options.items() if key not in ("horizon", "privileged")},
         )
 
 
-def _find(name: str) -> Environment:
-    by_id = {environment.id: environment for environment in ENVIRONMENTS.values()}
-    environment = ENVIRONMENTS.get(name) or by_id.get(name)
-    if environment is None:
-        raise SettingsError(f"unknown environment {name!r}; there are {', '.join(ENVIRONMENTS)}")
-    for module in ("gymnasium", "mujoco", environment.module):
+def make_scene(environment: Environment, **options: Any) -> Any:
+    """The gymnasium environment itself, without wrappers: it shows goals and knows where they are in the image.
+
+    Raises:
+        ModuleNotFoundError: if the simulator is missing, with what to install.
+    """
+    _check_installed(environment)
+    import gymnasium
+
+    _tell_gymnasium(environment)
+    return gymnasium.make(environment.id, **options).unwrapped
+
+
+def not_installed(environment: Environment) -> ModuleNotFoundError | None:
+    """What says which of the modules that an environment needs is not installed, if one is not."""
+    for module in ("gymnasium", *environment.modules):
         if find_spec(module) is None:
-            raise missing(f"environment {name!r}", module, environment.extra)
-    return environment
+            return missing(f"environment {environment.name!r}", module, environment.extra)
+    return None
+
+
+def _check_installed(environment: Environment) -> None:
+    if (error := not_installed(environment)) is not None:
+        raise error
+
+
+def _look_up(name: str) -> Environment | None:
+    def found() -> Environment | None:
+        return ENVIRONMENTS.get(name) or next((one for one in ENVIRONMENTS.values() if one.id == name), None)
+
+    if found() is None:
+        load_plugins()
+    return found()
+
+
+def _place(entry_point: str | Callable[..., Any]) -> str:
+    return entry_point if isinstance(entry_point, str) else f"{entry_point.__module__}:{entry_point.__qualname__}"
+
+
+def _tell_gymnasium(environment: Environment) -> None:
+    """Register with gymnasium, if that is installed and does not know it."""
+    if find_spec("gymnasium") is None:
+        return
+    import gymnasium
+
+    known = gymnasium.registry.get(environment.id)
+    if known is None or known.entry_point != environment.entry_point:
+        gymnasium.registry.pop(environment.id, None)  # a class of the same name, defined anew
+        gymnasium.register(id=environment.id, entry_point=environment.entry_point)
 
 
 def _make_one(environment: Environment, *, device: torch.device | str | None, **options: Any) -> EnvBase:
-    import torchrl_ocwm.envs  # noqa: F401  (registers the ids in a fresh process)
-
+    _tell_gymnasium(environment)  # this may be another process
     return TransformedEnv(GoalEnv(environment.id, device=device, **options), InitTracker())
+
+
+_OURS = {
+    "reacher": ("reacher:Reacher", EnvOptions, "dm_control"),
+    "cube_move": ("cube_move:CubeMove", CubeMoveOptions, "robosuite"),
+    "shelf_place": ("meta_world:ShelfPlace", MetaWorldOptions, "metaworld"),
+    "pick_place": ("meta_world:PickPlace", MetaWorldOptions, "metaworld"),
+}
+for _name, (_class, _options, _module) in _OURS.items():
+    register_environment(
+        _name,
+        f"torchrl_ocwm.envs.{_class}",
+        options=_options,
+        modules=("mujoco", _module),
+        extra=_module.replace("_", "-"),
+    )

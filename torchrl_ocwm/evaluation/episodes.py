@@ -15,7 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
-from torchrl_ocwm.envs import ENVIRONMENTS, Task, make_env
+from torchrl_ocwm.envs import Task, find_environment, make_env, make_scene
 from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.evaluation.randomness import EpisodeRandomness
@@ -87,9 +87,8 @@ class EvaluationEnvs:
         self, task: Task, *, episode_steps: int, workers: int = 2, envs: int = 10, timeout: float = 120.0
     ) -> None:
         self.task, self.episode_steps, self.envs = task, episode_steps, envs
-        make = partial(
-            SteppedEnvs, partial(make_env, task.name, horizon=episode_steps, privileged=True, **task.options)
-        )
+        options = {**task.options, "horizon": episode_steps, "privileged": True}
+        make = partial(SteppedEnvs, partial(make_env, find_environment(task.name), **options))
         self._workers: list[Worker] = []
         try:
             for _ in range(max(workers, 1)):
@@ -130,8 +129,8 @@ class EvaluationEnvs:
             progress: Show a progress bar.
 
         Returns:
-            ``[N, T]`` with ``object_position_true`` and ``object_position`` ``[O, D]``, ``reward`` and what else was
-            asked for, after each step, and ``goal_position``.
+            ``[N, T]`` with ``object_position_true`` and ``object_position`` ``[O, D]``, ``reward`` (of the first
+            object) and what else was asked for, after each step, and ``goal_position``.
 
         Raises:
             ValueError: for goals outside the workspace.
@@ -209,26 +208,29 @@ def episode_records(episodes: TensorDictBase) -> TensorDictBase:
     return torch.stack([episode_to_records(episode) for episode in episodes["transition"]])
 
 
-def goal_images(task: Task, goals: Tensor) -> Tensor:
-    """What would be seen with the object at each goal, its robot "teleported" there (paper, "Visual goals").
+def goal_images(task: Task, goals: Tensor, *, object_index: int = 0) -> Tensor:
+    """What would be seen with an object at each goal, its robot "teleported" there (paper, "Visual goals").
 
     Args:
         task: The task.
         goals: ``[N, D]`` metres. Where the robot cannot reach one, the nearest reachable position is shown.
+        object_index: Which object; the others stay where an episode starts.
 
     Returns:
         ``[N, 3, H, W]`` uint8.
     """
-    import gymnasium
-
-    with closing(gymnasium.make(ENVIRONMENTS[task.name].id, **task.options)) as env:
-        env.reset(seed=0)
-        scene: Any = env.unwrapped
-        return torch.stack([torch.from_numpy(scene.goal_observation(goal)["pixels"]) for goal in goals.numpy()])
+    with closing(make_scene(find_environment(task.name), **task.options)) as scene:
+        scene.reset(seed=0)
+        images = [scene.goal_observation(goal, object_index)["pixels"] for goal in goals.numpy()]
+        return torch.stack([torch.from_numpy(image) for image in images])
 
 
 def measure(episodes: TensorDictBase, *, object_index: int = 0) -> dict[str, Tensor]:
     """Scores of episodes ``[N, T]``, each ``[N]``: judged by the simulator's positions, not the estimated ones.
+
+    Args:
+        episodes: What :meth:`EvaluationEnvs.run` gave.
+        object_index: Which object was to go to the goals.
 
     Returns:
         ``final_score`` and ``mean_score`` (normalised score after the last step, and averaged over the episode),

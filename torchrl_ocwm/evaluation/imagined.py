@@ -10,16 +10,19 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_ocwm.agents.agent import Agent
+from torchrl_ocwm.agents.behaviour import LearntBehaviour
 from torchrl_ocwm.data.seeds import episode_seed
 from torchrl_ocwm.evaluation.randomness import EpisodeRandomness
 
 
 @torch.no_grad()
-def imagined_rollout(agent: Agent, latent: TensorDictBase, steps: int, *, seed: int = 0) -> TensorDictBase:
+def imagined_rollout(
+    agent: Agent | LearntBehaviour, latent: TensorDictBase, steps: int, *, seed: int = 0
+) -> TensorDictBase:
     """What an agent imagines from a latent when it acts on its own predictions, without exploration.
 
     Args:
-        agent: The agent.
+        agent: The agent, or one of its behaviours if not that which acts is meant.
         latent: ``[N]`` with state, belief and, if the agent is conditioned on one, goal.
         steps: Steps to imagine.
         seed: Seeds what the world model draws, together with the number of the row.
@@ -39,7 +42,13 @@ def imagined_rollout(agent: Agent, latent: TensorDictBase, steps: int, *, seed: 
 
 @torch.no_grad()
 def imagined_distance(
-    agent: Agent, latent: TensorDictBase, goals: Tensor, steps: int, *, object_index: int = 0, seed: int = 0
+    agent: Agent | LearntBehaviour,
+    latent: TensorDictBase,
+    goals: Tensor,
+    steps: int,
+    *,
+    object_index: int = 0,
+    seed: int = 0,
 ) -> Tensor:
     """How far from its goal an agent expects the object to be in the end.
 
@@ -47,7 +56,7 @@ def imagined_distance(
     large, the policy has not learned what the model would let it do.
 
     Args:
-        agent: The agent.
+        agent: The agent, or one of its behaviours if not that which acts is meant.
         latent: ``[N]``, as for :func:`imagined_rollout`.
         goals: ``[N, D]`` metres.
         steps: Steps to imagine.

@@ -5,12 +5,14 @@ from __future__ import annotations
 import torch
 
 from torchrl_ocwm.agents.agent import Agent
-from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, measure
+from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, goal_images, measure
 from torchrl_ocwm.settings import SettingsError
 
 
 class LandmarkEvaluation:
     """Evaluate an agent on its task's landmark goals, in this process.
+
+    An agent that takes goals as images only is given images of them.
 
     The paper draws its training curves with ten such goals. The environments are made at the first call and kept until
     it is closed.
@@ -29,11 +31,18 @@ class LandmarkEvaluation:
         if episodes > len(landmarks):
             raise SettingsError(f"eval_episodes={episodes}, but {agent.task.name} has {len(landmarks)} landmark goals")
         self.policy, self.goals = agent.policy(), torch.tensor(landmarks[:episodes])
+        self.images = (
+            None
+            if self.policy.takes_positions
+            else goal_images(agent.task, self.goals, object_index=self.policy.object_index)
+        )
         self.envs = EvaluationEnvs(agent.task, episode_steps=episode_steps, workers=0, envs=episodes)
 
     def __call__(self, updates: int) -> dict[str, float]:  # noqa: ARG002
         """Scores to log."""
-        scores = measure(self.envs.run(self.policy, self.goals))
+        scores = measure(
+            self.envs.run(self.policy, self.goals, images=self.images), object_index=self.policy.object_index
+        )
         return {f"evaluation/{name}": float(values.nanmean()) for name, values in scores.items()}
 
     def close(self) -> None:

@@ -13,10 +13,11 @@ class Evaluation(Settings):
     """Settings of an evaluation on a grid of goals.
 
     Args:
+        behaviour: Which of an agent's behaviours acts; ``None``: that which acts unless another is asked for.
         goals: Goals, laid out as a square grid over the reachable workspace.
         episode_steps: Steps per episode.
         image_goals: Also give the goals as images, what would be seen with the object there, to the agents that take
-            them.
+            both. Those that take nothing else get them anyway.
         random: Also evaluate smooth random actions.
         workers: Processes; 0 steps all environments in the process that evaluates. Scores do not depend on it.
         envs: Environments stepped in each process. Scores do not depend on it.
@@ -32,6 +33,7 @@ class Evaluation(Settings):
         3
     """
 
+    behaviour: str | None = None
     goals: int = setting(100, at_least=1, at_most=10**6)
     episode_steps: int = setting(150, at_least=1)
     image_goals: bool = False

@@ -208,12 +208,12 @@ class GivenGoals(TensorDictModuleBase):
 
     def _of_positions(self, position: Tensor) -> Tensor:
         if self.position is None:
-            raise ValueError("this agent takes goals as images, under ('goal', 'pixels')")
+            raise ValueError("this agent takes goals as images only, under ('goal', 'pixels')")
         return self.position(self.units(position))
 
     def _of_images(self, pixels: Tensor, batch_dims: int) -> Tensor:
         if self.image is None:
-            raise ValueError("this agent takes goals as positions; goal='object_latent' takes images too")
+            raise ValueError("this agent takes goals as positions; one with goal='object_latent' takes images too")
         if pixels.ndim == batch_dims + 3:
             pixels = pixels.unsqueeze(-4)
         if pixels.ndim != batch_dims + 4:

@@ -9,6 +9,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import RSSMPosteriorV3, RSSMPriorV3, RSSMStateEstimatorV3
 
+from torchrl_ocwm.modules.observation import ObservationEncoder
+
 
 class InitialLatent(TensorDictModuleBase):
     """Write the zero state and belief that a sequence starts from, unless they are there already.
@@ -86,3 +88,47 @@ class LatentOfImages(nn.Module):
         for embedding in embeddings.unbind(-2):
             latent = self.estimator(latent.set("encoded_latents", embedding))
         return latent["state"].reshape(*shape, -1), latent["belief"].reshape(*shape, -1)
+
+
+class LatentsInImages(nn.Module):
+    """Latents of images that are all there is: encoder and posterior, then extractor (paper, "Visual targets").
+
+    Args:
+        encoder: Embeds the images, without vectors.
+        latent: Takes the embeddings in, one after the other.
+        extractor: Makes of state and belief what is asked for: object latents, or both as one (:class:`FullLatent`).
+
+    Called with images ``[..., F, 3, H, W]`` uint8; returns what the extractor does, such as ``[..., O + 1, L]``.
+    """
+
+    def __init__(self, encoder: ObservationEncoder, latent: LatentOfImages, extractor: nn.Module) -> None:
+        super().__init__()
+        self.encoder, self.latent, self.extractor = encoder, latent, extractor
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        return self.extractor(*self.latent(self.encoder(pixels)))
+
+
+class LatentsInEmbedding(nn.Module):
+    """Latents of single images, from the embeddings of images and vectors.
+
+    Args:
+        images: What makes latents of images.
+
+    Called with embeddings ``[..., E]``; returns what ``images`` does.
+    """
+
+    def __init__(self, images: LatentsInImages) -> None:
+        super().__init__()
+        self.images = images
+
+    def forward(self, embedding: Tensor) -> Tensor:
+        alone = self.images.encoder.image_alone(embedding)
+        return self.images.extractor(*self.images.latent(alone.unsqueeze(-2)))
+
+
+class FullLatent(nn.Module):
+    """State ``[..., S]`` and belief ``[..., H]`` as one vector ``[..., S + H]`` float32."""
+
+    def forward(self, state: Tensor, belief: Tensor) -> Tensor:
+        return torch.cat([state.float(), belief.float()], -1)

@@ -8,10 +8,9 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor, nn
 
 from torchrl_ocwm.modules.architecture import Architecture
-from torchrl_ocwm.modules.latent import LatentOfImages
+from torchrl_ocwm.modules.latent import LatentsInEmbedding, LatentsInImages
 from torchrl_ocwm.modules.networks import make_mlp
 from torchrl_ocwm.modules.objects import LatentPositionalEncoder, ObjectDecoder, ObjectLatentExtractor, compose
-from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.world_model import VectorName, WorldModel, key_at, latent_at
 from torchrl_ocwm.settings import SettingsError
 
@@ -111,7 +110,7 @@ class ObjectWorldModel(WorldModel):
         return TensorDictSequential(
             records,
             TensorDictModule(encode, [("next", "object_units")], [("next", "positional_latent")]),
-            TensorDictModule(_LatentsInEmbedding(self.latents_in_images()), [("next", "encoded_latents")], [image]),
+            TensorDictModule(LatentsInEmbedding(self.latents_in_images()), [("next", "encoded_latents")], [image]),
             TensorDictModule(self.position_decoder, [image], [at_image]),
         )
 
@@ -133,37 +132,6 @@ class ObjectWorldModel(WorldModel):
     def object_latent(self, first: int | None = None) -> TensorDictModule:
         """Extracted object latents ``object_latent`` ``[..., O + 1, L]`` of imagined latents, or the first of them."""
         return TensorDictModule(_Instances(self.extractor, first), latent_at(("latent",)), ["object_latent"])
-
-
-class LatentsInImages(nn.Module):
-    """Object latents of images that are all there is: encoder and posterior, then extractor (paper, "Visual targets").
-
-    Args:
-        encoder: Embeds the images, without vectors.
-        latent: Takes the embeddings in, one after the other.
-        extractor: Extracts the object latents.
-
-    Called with images ``[..., F, 3, H, W]`` uint8; returns ``[..., O + 1, L]``.
-    """
-
-    def __init__(self, encoder: ObservationEncoder, latent: LatentOfImages, extractor: ObjectLatentExtractor) -> None:
-        super().__init__()
-        self.encoder, self.latent, self.extractor = encoder, latent, extractor
-
-    def forward(self, pixels: Tensor) -> Tensor:
-        return self.extractor(*self.latent(self.encoder(pixels)))
-
-
-class _LatentsInEmbedding(nn.Module):
-    """Object latents ``[..., O + 1, L]`` of single images, from the embeddings ``[..., E]`` of images and vectors."""
-
-    def __init__(self, images: LatentsInImages) -> None:
-        super().__init__()
-        self.images = images
-
-    def forward(self, embedding: Tensor) -> Tensor:
-        alone = self.images.encoder.image_alone(embedding)
-        return self.images.extractor(*self.images.latent(alone.unsqueeze(-2)))
 
 
 class _Instances(nn.Module):

@@ -44,23 +44,31 @@ class ObservationEncoder(nn.Module):
 
     def forward(self, pixels: Tensor, *vectors: Tensor) -> Tensor:
         """The embedding of an image and vectors."""
-        self._check(pixels, vectors)
-        image = self.cnn(unit_image(pixels))
+        self._check_vectors(vectors)
+        image = self.image(pixels)
         if self.mlp is None:
             return image
         if not vectors:
             return pad(image, (0, self.features - image.shape[-1]))
         return torch.cat([image, self.mlp(symlog(torch.cat(vectors, -1).float()))], -1)
 
-    def image_alone(self, embedding: Tensor) -> Tensor:
-        """Embeddings ``[..., features]`` of image and vectors to those that the images have without vectors."""
-        vectors = 0 if self.mlp is None else self.mlp_units
-        return pad(embedding[..., : self.features - vectors], (0, vectors))
-
-    def _check(self, pixels: Tensor, vectors: tuple[Tensor, ...]) -> None:
+    def image(self, pixels: Tensor) -> Tensor:
+        """The part of an embedding that is of the image, of images ``[..., 3, H, W]``."""
         expected = (3, self.image_size, self.image_size)
         if pixels.shape[-3:] != expected:
             raise ValueError(f"this model takes images of shape (..., *{expected}), got {tuple(pixels.shape)}")
+        return self.cnn(unit_image(pixels))
+
+    @property
+    def image_features(self) -> int:
+        """How many of the features are of the image."""
+        return self.features - (0 if self.mlp is None else self.mlp_units)
+
+    def image_alone(self, embedding: Tensor) -> Tensor:
+        """Embeddings ``[..., features]`` of image and vectors to those that the images have without vectors."""
+        return pad(embedding[..., : self.image_features], (0, self.features - self.image_features))
+
+    def _check_vectors(self, vectors: tuple[Tensor, ...]) -> None:
         if vectors and sum(vector.shape[-1] for vector in vectors) != self.vector_features:
             shapes = [tuple(vector.shape) for vector in vectors]
             raise ValueError(f"this model takes vectors of {self.vector_features} values in all, got shapes {shapes}")

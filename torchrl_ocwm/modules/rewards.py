@@ -9,6 +9,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import cosine_similarity, normalize
 
+from torchrl_ocwm.modules.latent import FullLatent
 from torchrl_ocwm.modules.units import WorkspaceUnits
 from torchrl_ocwm.settings import read
 
@@ -115,6 +116,46 @@ class LatentSimilarityReward(TensorDictModule):
     ) -> None:
         similarity = LatentSimilarity(object_index, distance)
         super().__init__(similarity, in_keys=[object_latent_key, goal_key], out_keys=[reward_key])
+
+
+class FullLatentReward(TensorDictModule):
+    """Cosine similarity of the latent of the whole scene, state and belief, and a goal that is such a latent (LEXA).
+
+    Args:
+        state_key: Stochastic state, ``[..., S]``.
+        belief_key: Deterministic state, ``[..., H]``.
+        goal_key: Goal latent, ``[..., S + H]``.
+        reward_key: Key written, ``[..., 1]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> latent = TensorDict({"state": torch.tensor([[3.0]]), "belief": torch.tensor([[4.0]])}, [1])
+        >>> latent["goal"] = torch.tensor([[0.0, 2.0]])
+        >>> FullLatentReward()(TensorDict({"latent": latent}, [1]))["reward"]
+        tensor([[0.8000]])
+    """
+
+    def __init__(
+        self,
+        *,
+        state_key: NestedKey = ("latent", "state"),
+        belief_key: NestedKey = ("latent", "belief"),
+        goal_key: NestedKey = ("latent", "goal"),
+        reward_key: NestedKey = "reward",
+    ) -> None:
+        super().__init__(_FullLatentSimilarity(), in_keys=[state_key, belief_key, goal_key], out_keys=[reward_key])
+
+
+class _FullLatentSimilarity(nn.Module):
+    """State, belief and a goal ``[..., S + H]`` to ``[..., 1]``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.latent = FullLatent()
+
+    def forward(self, state: Tensor, belief: Tensor, goal: Tensor) -> Tensor:
+        return cosine_similarity(self.latent(state, belief), goal, dim=-1).unsqueeze(-1)
 
 
 class PositionDistanceReward(TensorDictModule):

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.modules import RSSMRolloutV3, RSSMStateEstimatorV3, SymExpTwoHot
 
 from torchrl_ocwm.modules.architecture import Architecture
-from torchrl_ocwm.modules.latent import InitialLatent, LatentOfImages
+from torchrl_ocwm.modules.latent import FullLatent, InitialLatent, LatentOfImages, LatentsInEmbedding, LatentsInImages
 from torchrl_ocwm.modules.networks import make_image_decoder, make_mlp, make_rssm
 from torchrl_ocwm.modules.observation import ObservationEncoder
 from torchrl_ocwm.modules.units import WorkspaceUnits
@@ -98,7 +98,7 @@ class WorldModel(nn.Module, ABC):
         rollout.in_keys = [*rollout.in_keys, "is_init"]  # TorchRL's takes it as optional: then memory crosses episodes
         return TensorDictSequential(
             InitialLatent(self.state, self.belief),
-            TensorDictModule(_bounded, ["action"], ["bounded_action"]),
+            TensorDictModule(bounded, ["action"], ["bounded_action"]),
             *self._encode("next"),
             rollout,
             *self.decoders("next"),
@@ -150,7 +150,7 @@ class WorldModel(nn.Module, ABC):
         """Next state and belief, sampled from the prior. Actions beyond [−1, 1] count as clipped."""
         latent = latent_at(("latent",))
         return TensorDictSequential(
-            TensorDictModule(_bounded, ["action"], ["bounded_action"]),
+            TensorDictModule(bounded, ["action"], ["bounded_action"]),
             TensorDictModule(self.prior, [*latent, "bounded_action"], ["_", *latent]),
         )
 
@@ -202,6 +202,7 @@ class FlatWorldModel(WorldModel):
         image_size: Height and width of the images, pixels.
         observed: Vectors that the encoder sees and the decoder reconstructs.
         architecture: Shapes of the networks.
+        image_latent: Whether the latents of images alone are learnt, which are goals then.
         kwargs: The other arguments of :class:`WorldModel`.
 
     Examples:
@@ -219,11 +220,33 @@ class FlatWorldModel(WorldModel):
         image_size: int,
         observed: tuple[VectorName, ...],
         architecture: Architecture,
+        image_latent: bool = False,
         **kwargs: Any,
     ) -> None:
         scene: dict[str, Any] = {"image_size": image_size, "observed": observed, "architecture": architecture}
         super().__init__(decoded=observed, **scene, **kwargs)
         self.image_decoder = make_image_decoder(architecture, self.latent_features, image_size)
+        self.image_latent = image_latent
+
+    def records(self) -> TensorDictSequential:
+        """Posterior, prior and predictions for records ``[B, T]``; everything is read and written under ``next``.
+
+        With ``image_latent`` also the latent ``image_latent`` ``[B, T, S + H]`` of each image alone, as if it were the
+        first frame of an episode, and the positions ``reco_image_units`` ``[B, T, O * D]`` in it.
+        """
+        records = super().records()
+        if not self.image_latent:
+            return records
+        embedding, image = ("next", "encoded_latents"), ("next", "image_latent")
+        modules = [TensorDictModule(LatentsInEmbedding(self.latent_in_images()), [embedding], [image])]
+        if "object_position" in self.vector_decoders:
+            decoder = self.vector_decoders["object_position"]
+            modules.append(TensorDictModule(decoder, [image], [("next", "reco_image_units")]))
+        return TensorDictSequential(records, *modules)
+
+    def latent_in_images(self) -> LatentsInImages:
+        """State and belief ``[..., S + H]`` after images ``[..., F, 3, H, W]`` uint8, one after the other."""
+        return LatentsInImages(self.encoder, self.latent_of_images(), FullLatent())
 
     def images(self, *at: str) -> list[TensorDictModuleBase]:
         """``reco_pixels``."""
@@ -257,7 +280,7 @@ class _ObjectUnits(nn.Module):
         return self.units(metres).flatten(-2)
 
 
-def _bounded(action: Tensor) -> Tensor:
+def bounded(action: Tensor) -> Tensor:
     """Clip to [−1, 1] and keep a gradient beyond, as TorchRL's block GRU does by itself."""
     action = action.float()
     return action / action.detach().abs().clamp_min(1)

@@ -1,17 +1,22 @@
 """What is minimised: loss modules."""
 
 from torchrl_ocwm.objectives.dreamer import BehaviourLoss, GoalConditionedDreamerLoss
+from torchrl_ocwm.objectives.ensemble import EnsembleLoss
 from torchrl_ocwm.objectives.focus import FOCUSModelLoss, mask_nll, object_reconstruction, positional_latent_loss
+from torchrl_ocwm.objectives.temporal_distance import TemporalDistanceLoss, temporal_pairs
 from torchrl_ocwm.objectives.world_model import WorldModelLoss, image_reconstruction, symlog_reconstruction
 
 __all__ = [
     "BehaviourLoss",
+    "EnsembleLoss",
     "FOCUSModelLoss",
     "GoalConditionedDreamerLoss",
+    "TemporalDistanceLoss",
     "WorldModelLoss",
     "image_reconstruction",
     "mask_nll",
     "object_reconstruction",
     "positional_latent_loss",
     "symlog_reconstruction",
+    "temporal_pairs",
 ]

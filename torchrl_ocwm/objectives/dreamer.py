@@ -54,10 +54,13 @@ class BehaviourLoss(LossModule):
         Attributes:
             state (NestedKey): Posterior state under ``next``, ``[B, T, S]``. Defaults to ``"state"``.
             belief (NestedKey): Belief under ``next``, ``[B, T, H]``. Defaults to ``"belief"``.
+            is_init (NestedKey): First records of episodes, ``[B, T, 1]`` bool, at the root; for goal sources that ask
+                for it. Defaults to ``"is_init"``.
         """
 
         state: NestedKey = "state"
         belief: NestedKey = "belief"
+        is_init: NestedKey = "is_init"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -96,9 +99,11 @@ class BehaviourLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """The posterior, and what goal source, reward loss and replay loss read of the records."""
         after = [self.tensor_keys.state, self.tensor_keys.belief, *self._source_keys()]
-        keys = [unravel_key(("next", key)) for key in after]
+        start = self.tensor_keys.is_init
+        keys = [key if key == start else unravel_key(("next", key)) for key in after]
         if self.reward_loss is not None:
-            keys += [key[1:] for key in self.reward_loss.in_keys if isinstance(key, tuple) and key[0] == "records"]
+            read = [key for key in self.reward_loss.in_keys if isinstance(key, tuple) and key[0] == "records"]
+            keys += [unravel_key(key[1:]) for key in read]
         if self.replay_value_loss_weight:
             value = self.value_loss.tensor_keys
             keys += [unravel_key(("next", key)) for key in (value.reward, value.done, value.terminated)]
@@ -113,7 +118,7 @@ class BehaviourLoss(LossModule):
 
     def forward(self, records: TensorDictBase) -> TensorDictBase:
         """Losses and metrics, scalars, of records ``[B, T]`` with what the world model made of them under ``next``."""
-        actor_losses, imagined = self.actor_loss(self.imagination_start(records.get("next")))
+        actor_losses, imagined = self.actor_loss(self.imagination_start(self._frames(records)))
         losses = actor_losses.update(self.value_loss(imagined.detach())[0])
         if self.replay_value_loss_weight:
             losses["loss_replay_value"] = self.replay_value_loss_weight * self._replay_value(records, imagined)
@@ -135,6 +140,11 @@ class BehaviourLoss(LossModule):
             return start.reshape(-1)
         with torch.no_grad():
             return self.goal_source(start.update(frames.select(*self._source_keys()))).reshape(-1)
+
+    def _frames(self, records: TensorDictBase) -> TensorDictBase:
+        """What is known of the frames, and which are the first of their episodes if the goal source asks for it."""
+        start, frames = self.tensor_keys.is_init, records.get("next")
+        return frames.copy().set(start, records.get(start)) if start in self._source_keys() else frames
 
     def _source_keys(self) -> list[NestedKey]:
         """What the goal source reads beside state and belief."""
@@ -217,12 +227,12 @@ class GoalConditionedDreamerLoss(LossModule):
         return [behaviour for behaviour in self.behaviours.children() if isinstance(behaviour, BehaviourLoss)]
 
     def set_keys(self, **kwargs: NestedKey) -> None:
-        """Set keys, those of the latents in the behaviours too."""
+        """Set keys, those that the behaviours have in common with it there too."""
         super().set_keys(**kwargs)
-        latents = {name: key for name, key in kwargs.items() if name in ("state", "belief")}
-        if latents:
+        shared = {name: key for name, key in kwargs.items() if name in ("state", "belief", "is_init")}
+        if shared:
             for behaviour in self._each():
-                behaviour.set_keys(**latents)
+                behaviour.set_keys(**shared)
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         pass

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
 from torchrl_ocwm.modules.dtypes import flags, unit_image
-from torchrl_ocwm.objectives.world_model import Term, WorldModelLoss, visible_position_reconstruction
+from torchrl_ocwm.objectives.world_model import Term, WorldModelLoss
 from torchrl_ocwm.settings import read
 
 LatentDistance = Literal["cosine", "mse"]
@@ -124,11 +124,10 @@ class FOCUSModelLoss(WorldModelLoss):
         lambda_masks: Weight of the masks, −log p summed over the image.
         lambda_object_pixels: Weight of the colours inside the true masks, squared error summed over the image.
         lambda_positional: Weight of L_pos.
-        lambda_image_latent: Weight of what makes an image alone a goal: the position in it, weighted like the object
-            positions too, and minus the cosine similarity of its object latents and those of the whole observation.
         positional_distance: ``"cosine"``, the default, or ``"mse"``.
         positional_gradient: What L_pos trains: ``"encoder"``, ``"latent"`` or ``"both"``, the default.
-        kwargs: The arguments of :class:`~torchrl_ocwm.objectives.WorldModelLoss`, but for ``lambda_pixels``.
+        kwargs: The arguments of :class:`~torchrl_ocwm.objectives.WorldModelLoss`, but for ``lambda_pixels``; its
+            ``lambda_image_latent`` is about object latents here.
 
     Raises:
         ValueError: for an unknown distance or gradient, and as :class:`~torchrl_ocwm.objectives.WorldModelLoss` does,
@@ -158,8 +157,6 @@ class FOCUSModelLoss(WorldModelLoss):
                 ``"positional_latent"``.
             image_latent (NestedKey): Latents of each image alone, ``[B, T, O + 1, L]``. Defaults to
                 ``"image_latent"``.
-            reco_image_position (NestedKey): Positions decoded from these, ``[B, T, O * D]``. Defaults to
-                ``"reco_image_units"``.
         """
 
         masks: NestedKey = "masks"
@@ -168,7 +165,6 @@ class FOCUSModelLoss(WorldModelLoss):
         object_latent: NestedKey = "object_latent"
         positional_latent: NestedKey = "positional_latent"
         image_latent: NestedKey = "image_latent"
-        reco_image_position: NestedKey = "reco_image_units"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -180,7 +176,6 @@ class FOCUSModelLoss(WorldModelLoss):
         lambda_masks: float | None = None,
         lambda_object_pixels: float | None = None,
         lambda_positional: float | None = None,
-        lambda_image_latent: float | None = None,
         positional_distance: LatentDistance | None = None,
         positional_gradient: PositionalGradient | None = None,
         **kwargs: Any,
@@ -190,7 +185,6 @@ class FOCUSModelLoss(WorldModelLoss):
             masks=lambda_masks,
             object_pixels=lambda_object_pixels,
             positional=lambda_positional,
-            image_latent=lambda_image_latent,
         )
         for name, value in (("positional_distance", positional_distance), ("positional_gradient", positional_gradient)):
             if value is not None:
@@ -205,7 +199,8 @@ class FOCUSModelLoss(WorldModelLoss):
     def terms(self) -> dict[str, Term]:
         """Masks and masked colours in place of the image, and what the two kinds of goals are encoded with."""
         terms = super().terms()
-        del terms["pixels"]
+        image_position = terms.pop("image_position")
+        del terms["pixels"], terms["image_latent"]
         return {
             **terms,
             # L_obj (paper, appendix): first the masks, then the colours inside the true masks.
@@ -213,16 +208,8 @@ class FOCUSModelLoss(WorldModelLoss):
             "object_pixels": Term("reco_object_pixels", ("pixels", "masks"), object_reconstruction),
             "positional": Term("positional_latent", ("object_latent", "object_visible"), self._positional),  # L_pos
             "image_latent": Term("image_latent", ("object_latent", "object_visible"), self._image_latent),
-            "image_position": Term(
-                "reco_image_position", ("object_position", "object_visible"), visible_position_reconstruction
-            ),
+            "image_position": image_position,
         }
-
-    def weight(self, term: str) -> float:
-        """The weight of a term; the position in an image alone has both weights that it is about."""
-        if term == "image_position":
-            return self.lambda_image_latent * self.lambda_object_position
-        return super().weight(term)
 
     def _positional(self, predicted: Tensor, latent: Tensor, visible: Tensor) -> Tensor:
         objects = latent[..., :-1, :]

@@ -9,8 +9,8 @@ from typing import NamedTuple
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits
+from torch import Tensor, cat
+from torch.nn.functional import binary_cross_entropy_with_logits, cosine_similarity
 from torchrl.objectives import DreamerV3ModelLoss, categorical_kl_terms, symlog, two_hot_cross_entropy
 
 from torchrl_ocwm.modules.dtypes import flags, unit_image
@@ -65,6 +65,23 @@ def visible_position_reconstruction(prediction: Tensor, target: Tensor, visible:
     return (error.sum(-1) * flags(visible, "object_visible")).sum(-1).mean()
 
 
+def latent_dissimilarity(prediction: Tensor, state: Tensor, belief: Tensor) -> Tensor:
+    """Minus the cosine similarity of latents and those that they are to be like, averaged over the batch.
+
+    Args:
+        prediction: ``[*batch, S + H]``.
+        state: ``[*batch, S]``. State and belief are not trained.
+        belief: ``[*batch, H]``.
+
+    Examples:
+        >>> import torch
+        >>> latent_dissimilarity(torch.tensor([[6.0, 8.0]]), torch.tensor([[3.0]]), torch.tensor([[4.0]]))
+        tensor(-1.)
+    """
+    target = cat([state.float(), belief.float()], -1).detach()
+    return -cosine_similarity(prediction.float(), target, dim=-1).mean()
+
+
 def continuation_nll(logits: Tensor, terminated: Tensor) -> Tensor:
     """−log p that an episode goes on, or that it has ended by itself, averaged over the batch.
 
@@ -115,6 +132,8 @@ class WorldModelLoss(DreamerV3ModelLoss):
         lambda_goal_position: Weight of the goal position, likewise.
         lambda_reward: Weight of the reward, two-hot cross-entropy.
         lambda_continue: Weight of the continuation, binary cross-entropy.
+        lambda_image_latent: Weight of what makes an image alone a goal: the position in it, weighted like the object
+            positions too, and minus the cosine similarity of its latent and that of the whole observation.
         free_nats: Smallest KL that is charged, nats per step.
         unimix: Share of the uniform distribution in prior and posterior.
 
@@ -156,6 +175,12 @@ class WorldModelLoss(DreamerV3ModelLoss):
             reco_goal_position (NestedKey): Its prediction. Defaults to ``"reco_goal_units"``.
             continue_pred (NestedKey): Predicted continuation logit. Defaults to ``"continue_pred"``.
             terminated (NestedKey): Whether the episode ended by itself. Defaults to ``"terminated"``.
+            state (NestedKey): Posterior state, ``[B, T, S]``. Defaults to ``"state"``.
+            belief (NestedKey): Belief, ``[B, T, H]``. Defaults to ``"belief"``.
+            image_latent (NestedKey): State and belief of each image alone, ``[B, T, S + H]``. Defaults to
+                ``"image_latent"``.
+            reco_image_position (NestedKey): Positions decoded from these, ``[B, T, O * D]``. Defaults to
+                ``"reco_image_units"``.
             true_reward (NestedKey): Not used; TorchRL's loss has it.
             done (NestedKey): Not used; TorchRL's loss has it.
         """
@@ -167,6 +192,10 @@ class WorldModelLoss(DreamerV3ModelLoss):
         object_visible: NestedKey = "object_visible"
         goal_position: NestedKey = "goal_units"
         reco_goal_position: NestedKey = "reco_goal_units"
+        state: NestedKey = "state"
+        belief: NestedKey = "belief"
+        image_latent: NestedKey = "image_latent"
+        reco_image_position: NestedKey = "reco_image_units"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -183,6 +212,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
         lambda_goal_position: float | None = None,
         lambda_reward: float | None = None,
         lambda_continue: float | None = None,
+        lambda_image_latent: float | None = None,
         free_nats: float = 1.0,
         unimix: float = 0.01,
     ) -> None:
@@ -202,6 +232,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
             object_position=lambda_object_position,
             goal_position=lambda_goal_position,
             reward=lambda_reward,
+            image_latent=lambda_image_latent,
             **{"continue": lambda_continue},
         )
 
@@ -216,10 +247,16 @@ class WorldModelLoss(DreamerV3ModelLoss):
             "goal_position": Term("reco_goal_position", ("goal_position",), symlog_reconstruction),
             "reward": Term("reward_logits", ("reward",), self._reward_nll),
             "continue": Term("continue_pred", ("terminated",), continuation_nll),
+            "image_latent": Term("image_latent", ("state", "belief"), latent_dissimilarity),
+            "image_position": Term(
+                "reco_image_position", ("object_position", "object_visible"), visible_position_reconstruction
+            ),
         }
 
     def weight(self, term: str) -> float:
-        """The weight of a term."""
+        """The weight of a term; the position in an image alone has both weights that it is about."""
+        if term == "image_position":
+            return self.lambda_image_latent * self.lambda_object_position
         return getattr(self, f"lambda_{term}")
 
     @property

@@ -18,7 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
-from torchrl_ocwm.agents import AGENTS, SIZES
+from torchrl_ocwm.agents import AGENTS, EXPLORERS, SIZES
+from torchrl_ocwm.agents.config import EXPLORE
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
@@ -39,7 +40,7 @@ def recipe(
 
     Args:
         name: Name of the recipe.
-        groups: Groups of options that it takes (``agent``, ``size``, ``env``), each with its default.
+        groups: Groups of options that it takes (``agent``, ``explore``, ``size``, ``env``), each with its default.
         more: Settings of Hydra itself.
     """
 
@@ -63,15 +64,19 @@ def recipe(
 
 
 def store_options() -> None:
-    """Put agents, sizes and environments into Hydra's store, those of plugins too."""
+    """Put agents, explorers, sizes and environments into Hydra's store, those of plugins too."""
     load_plugins()
     store = ConfigStore.instance()
     for group, rows in (("agent", AGENTS), ("size", SIZES)):
         for name, row in rows.items():
             # Not closed: a part may be replaced by one with other settings, which the classes know.
             store.store(name, OmegaConf.create(to_dict(row), flags={"struct": False}), group=group)
+    store.store("none", {}, group="explore", package="_global_")
+    for name, behaviour in EXPLORERS.items():  # beside the behaviours of the row
+        node = OmegaConf.create(to_dict(behaviour), flags={"struct": False})
+        store.store(name, node, group="explore", package=f"agent.behaviours.{EXPLORE}")
     for name, environment in ENVIRONMENTS.items():
-        store.store(name, {"name": name, "options": to_dict(environment.options())}, group="env")
+        store.store(name, {"name": name, "options": defaults(environment.options)}, group="env")
 
 
 def keep_settings(settings: Any, folder: Path) -> None:
@@ -112,6 +117,17 @@ def help_lines(kind: type, at: str = "") -> Iterator[str]:
             yield f"{name}{value}: {docs.get(one.name, '')}"
 
 
+def defaults(kind: Any) -> dict[str, Any]:
+    """The fields of a settings class with their defaults; ``"???"``, as Hydra has it, for what has to be given.
+
+    Examples:
+        >>> from torchrl_ocwm.agents import DreamerV3
+        >>> defaults(DreamerV3)
+        {'warmup': 0}
+    """
+    return {one.name: _default(one) for one in fields(kind)}
+
+
 @contextmanager
 def _user_errors() -> Iterator[None]:
     """What a user can mend ends the script with one line."""
@@ -125,12 +141,12 @@ def _user_errors() -> Iterator[None]:
 
 def _schema(kind: type, groups: Mapping[str, str], more: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration of a recipe: its groups, and all other settings with their defaults."""
-    plain = {one.name: _default(one) for one in fields(kind) if one.name not in groups}
-    defaults: list[Any] = [{group: choice} for group, choice in groups.items()]
+    plain = {name: value for name, value in defaults(kind).items() if name not in groups}
+    chosen: list[Any] = [{group: choice} for group, choice in groups.items()]
     quiet = [{f"override hydra/{part}": "none"} for part in _QUIET]
     text = "\n".join(help_lines(kind)).replace("$", "")
     own = {"run": {"dir": "."}, "output_subdir": None, "help": {"header": f"Settings:\n{text}\n"}, **more}
-    return {"defaults": [*defaults, "_self_", *quiet], **plain, "hydra": own}
+    return {"defaults": [*chosen, "_self_", *quiet], **plain, "hydra": own}
 
 
 def _given(config: DictConfig) -> dict[str, Any]:
@@ -139,10 +155,10 @@ def _given(config: DictConfig) -> dict[str, Any]:
         raise SettingsError(f"{lacking[0]} is missing; give it, as in {lacking[0]}=...")
     values: Any = OmegaConf.to_container(config, resolve=True)
     choices = HydraConfig.get().runtime.choices
-    for group, rows in (("agent", AGENTS), ("size", SIZES)):
-        if group in values and choices.get(group) in rows:
-            values[group] = _without_leftovers(values[group], to_dict(rows[choices[group]]))
-    return values
+    rows = {group: to_dict(known.get(choices.get(group))) for group, known in (("agent", AGENTS), ("size", SIZES))}
+    if rows["agent"] and choices.get("explore") in EXPLORERS:
+        rows["agent"]["behaviours"][EXPLORE] = to_dict(EXPLORERS[choices["explore"]])
+    return {name: _without_leftovers(value, rows.get(name)) for name, value in values.items()}
 
 
 def _without_leftovers(values: Any, row: Any) -> Any:
@@ -151,7 +167,7 @@ def _without_leftovers(values: Any, row: Any) -> Any:
         return values
     if values.get("name") == row.get("name"):
         return {name: _without_leftovers(value, row.get(name)) for name, value in values.items()}
-    parts = [kind[values["name"]] for kind in Part.registered.values() if values["name"] in kind]
+    parts = [part for kind in Part.registered.values() for name, part in kind.items() if name == values.get("name")]
     known = {one.name for part in parts for one in fields(part)}
     return {name: value for name, value in values.items() if name in known or row.get(name) != value}
 

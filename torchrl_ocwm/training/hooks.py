@@ -139,13 +139,16 @@ class StopOnSignals:
     Args:
         trainer: The trainer to stop.
 
+    Attributes:
+        stopped: Whether a signal has come.
+
     Use it in a ``with`` block.
     """
 
     def __init__(self, trainer: Trainer) -> None:
         self.trainer = trainer
+        self.stopped = self._looking = False
         self._before: dict[int, Any] = {}
-        self._stopped = self._looking = False
 
     def __enter__(self) -> StopOnSignals:
         try:
@@ -161,19 +164,19 @@ class StopOnSignals:
 
     def _stop(self, number: int, frame: Any) -> None:  # noqa: ARG002
         signal.signal(number, self._before[number])
-        self._stopped = True
+        self.stopped = True
         self.trainer.request_stop(signal.Signals(number).name)
         if self._looking:
             raise _Stopped
 
-    def look(self, function: Callable[[int], Any], updates: int) -> Any:
+    def look(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call what only looks at the agent: it changes no random number, and a signal breaks it off."""
         try:
             self._looking = True
             result = None
-            if not self._stopped:
+            if not self.stopped:
                 with torch.random.fork_rng():
-                    result = function(updates)
+                    result = function(*arguments)
             self._looking = False
             return result
         except _Stopped:

@@ -18,13 +18,14 @@ def trained_with(training: Training, dataset: EpisodeDataset) -> dict[str, Any]:
     return {"training": training.deciding(), "dataset": _fingerprint(dataset, len(dataset.episode_lengths))}
 
 
-def check_may_go_on(file: Path, training: Training, dataset: EpisodeDataset) -> None:
+def check_may_go_on(file: Path, training: Training, dataset: EpisodeDataset, *, grows: bool = False) -> None:
     """Raise unless a run may go on from a checkpoint with these settings and this dataset.
 
     Args:
         file: The checkpoint, which has been checked for damage.
         training: The settings; what ``changed`` names may differ.
         dataset: The dataset, wherever it is now.
+        grows: It may have grown.
 
     Raises:
         CheckpointError: with what differs, and what may be said to go on.
@@ -37,7 +38,7 @@ def check_may_go_on(file: Path, training: Training, dataset: EpisodeDataset) -> 
             stacklevel=2,
         )
         return
-    differences = {**_other_settings(there["training"], training), **_other_dataset(there["dataset"], dataset)}
+    differences = {**_other_settings(there["training"], training), **_other_dataset(there["dataset"], dataset, grows)}
     refused = [name for name in differences if name not in training.changed]
     if refused:
         what = "; ".join(differences[name] for name in refused)
@@ -73,12 +74,12 @@ def _other_settings(there: dict[str, Any], training: Training) -> dict[str, str]
     }
 
 
-def _other_dataset(there: dict[str, Any], dataset: EpisodeDataset) -> dict[str, str]:
+def _other_dataset(there: dict[str, Any], dataset: EpisodeDataset, grows: bool) -> dict[str, str]:
     episodes = len(dataset.episode_lengths)
     if there["episodes"] > episodes or _fingerprint(dataset, there["episodes"]) != there:
         return {"dataset": f"dataset: {there['episodes']} other episodes there than in {dataset.path}"}
     more = episodes - there["episodes"]
-    return {"dataset": f"dataset: {dataset.path} has grown by {more} episodes"} if more else {}
+    return {"dataset": f"dataset: {dataset.path} has grown by {more} episodes"} if more and not grows else {}
 
 
 def _fingerprint(dataset: EpisodeDataset, episodes: int) -> dict[str, Any]:

@@ -79,5 +79,52 @@ class Training(Settings):
         return {one.name: getattr(self, one.name) for one in fields(self) if _resume(one) != "free"}
 
 
+@dataclass(frozen=True)
+class Online(Settings):
+    """How an agent collects while it learns. All of it may change when a run goes on.
+
+    A run begins with the seed steps, makes ``seed_updates``, and then alternates: a round of episodes, played with the
+    weights of that moment, and the updates that its steps are due.
+
+    Args:
+        steps: Environment steps, seed steps included, after which nothing more is collected; updates go on.
+        seed_policy: Who collects the seed steps, one after the other: names or checkpoints, as ``policy`` of a
+            collection (:class:`~torchrl_ocwm.data.settings.Collection`).
+        seed_steps: Environment steps of each of them.
+        seed_updates: Updates before the first round.
+        update_ratio: Updates per environment step afterwards.
+        round_episodes: Episodes of a round; with ``"sync"`` as many as all workers play at a time, or a multiple.
+        behaviours: Behaviours of the agent that act in turn, one episode each; none: all that it has.
+        collector: ``"sync"`` collects and updates in turn, ``"async"`` also collects during updates, with weights that
+            are up to a round old; ``"ray"`` is ``"async"`` in the processes of a Ray cluster.
+        workers: Processes that play, one environment each; 0 plays in this one, with ``"sync"`` only.
+        timeout: Seconds without a whole episode of a worker after which all count as hanging and are replaced.
+
+    Raises:
+        SettingsError: for a setting out of its range, with its name.
+    """
+
+    steps: int = setting(100_000, at_least=1)
+    seed_policy: tuple[str, ...] = ("random",)
+    seed_steps: tuple[int, ...] = setting((5_000,), at_least=1)
+    seed_updates: int = setting(100, at_least=1)
+    update_ratio: float = setting(0.25, above=0)
+    round_episodes: int = setting(2, at_least=1)
+    behaviours: tuple[str, ...] = ()
+    collector: Literal["sync", "async", "ray"] = "sync"
+    workers: int = setting(2, at_least=0, at_most=1024)
+    timeout: float = setting(600.0, above=0)
+
+    def validate(self) -> None:
+        """Each seed policy has its steps, and collectors have the processes that they need."""
+        if not self.seed_policy or len(self.seed_policy) != len(self.seed_steps):
+            raise SettingsError(
+                f"seed_steps must have one number for each seed_policy, got {list(self.seed_steps)} for "
+                f"{list(self.seed_policy)}"
+            )
+        if self.collector != "sync" and not self.workers:
+            raise SettingsError(f"workers must be at least 1 with collector={self.collector}, got 0")
+
+
 def _resume(one: Any) -> Resume:
     return one.metadata.get("resume", "free")

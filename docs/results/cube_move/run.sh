@@ -44,7 +44,7 @@ for agent in dreamer focus_pcp focus_lcp; do
   cp "$(run $agent)/log/scalars/return_high.csv" $here/${agent}_seed_0_imagined_return.csv
 done
 python examples/diagnose.py checkpoint="$(run focus_lcp)/checkpoint.zip" dataset=$data \
-  output=$here/diagnosis hydra.output_subdir=null
+  output=$here/diagnosis
 python examples/evaluate.py goals=${GOALS:-36} image_goals=true episode_steps=100 workers=0 envs=18 \
-  output=$here hydra.output_subdir=null \
+  output=$here \
   "checkpoint=[$(run dreamer)/checkpoint.zip,$(run focus_pcp)/checkpoint.zip,$(run focus_lcp)/checkpoint.zip]"

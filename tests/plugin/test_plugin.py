@@ -1,0 +1,194 @@
+"""Parts, rows and environments of another package, which is not installed but named in the environment variable."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.checkpoint import CheckpointError
+
+from torchrl_ocwm import build_agent, load_agent, make_env, make_task
+from torchrl_ocwm.agents import AGENTS, SIZES, Agent, Behaviour, save_agent
+from torchrl_ocwm.agents.checkpoint import describe, read_parts
+from torchrl_ocwm.data import EpisodeDataset
+from torchrl_ocwm.envs import EnvChoice, find_environment
+from torchrl_ocwm.evaluation import EvaluationEnvs
+from torchrl_ocwm.parts import VARIABLE, load_plugins
+from torchrl_ocwm.settings import SettingsError, change, to_dict
+from torchrl_ocwm.testing import random_records, reacher_task
+
+HERE, ROOT = Path(__file__).parent, Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plugin(registries: None) -> Iterator[None]:
+    """The package can be found, and is gone afterwards."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(HERE)
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(HERE), str(ROOT), os.environ.get("PYTHONPATH", "")]))
+        patch.setenv(VARIABLE, "ocwm_example")
+        load_plugins.cache_clear()
+        yield
+    for name in [name for name in sys.modules if name.split(".")[0] == "ocwm_example"]:
+        del sys.modules[name]
+    load_plugins.cache_clear()
+
+
+LOAD = """
+import os, sys
+from torchrl.checkpoint import CheckpointError
+from torchrl_ocwm import load_agent
+from torchrl_ocwm.parts import load_plugins
+
+named = os.environ.pop("TORCHRL_OCWM_PLUGINS")
+try:
+    load_agent(sys.argv[1])
+except CheckpointError as error:
+    print(error)
+os.environ["TORCHRL_OCWM_PLUGINS"] = named
+load_plugins.cache_clear()
+print(load_agent(sys.argv[1]).agent.config)
+"""
+
+
+def all_parts() -> Agent:
+    """An agent with all parts of the other package."""
+    config = change(
+        AGENTS["dreamer_pcp"],
+        {
+            "world_model": "wide",
+            "behaviours.reach.reward": {"name": "nearness", "width": 0.2},
+            "behaviours.reach.goals": "remembered",
+            "behaviours.explore": {"reward": "novelty"},
+        },
+    )
+    return build_agent(config, reacher_task(), change(SIZES["debug"], {"learning.optimizer": "sgd"}))
+
+
+def example(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(ROOT / "examples" / script), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_a_row_by_its_name() -> None:
+    """The first use of an unknown name loads the package."""
+    assert "nearness" not in AGENTS
+    agent = build_agent("nearness", reacher_task(), "debug")
+    assert agent.loss(random_records(reacher_task(), 2, 3))["loss_actor"].isfinite()
+
+
+def test_all_kinds_of_parts() -> None:
+    agent = all_parts()
+    assert agent.model.belief == 2 * SIZES["debug"].architecture.belief
+    losses = agent.loss(random_records(reacher_task(), 2, 3))
+    assert losses["loss_explore_novelty"] > 0
+    rates = [group["lr"] for group in agent.parameter_groups()]
+    assert rates[-1] == 1e-2
+    optimizer = agent.size.learning.optimizer.build(agent.parameter_groups())
+    assert type(optimizer) is torch.optim.SGD
+    guess = agent.behaviour("explore").loss.reward_loss.network.guess
+    before = guess.weight.clone()
+    losses["loss_explore_novelty"].backward()
+    optimizer.step()
+    assert not torch.equal(guess.weight, before)
+
+
+def test_a_goal_source_with_a_buffer_is_saved_moved_and_seen() -> None:
+    agent = all_parts()
+    source = agent.behaviour("reach").loss.goal_source[0]
+    (name,) = (name for name in agent.loss.state_dict() if name.endswith("places"))
+    assert any(module is source for module in agent.loss.modules())
+    agent.loss.load_state_dict({**agent.loss.state_dict(), name: torch.full((3, 2), 0.5)})
+    assert (source.places == 0.5).all()
+    records = agent.model.records()(random_records(reacher_task(), 2, 3))
+    start = agent.behaviour("reach").loss.imagination_start(records["next"])
+    assert (start["latent", "goal"] == 0.5).all()
+    agent.loss.to(torch.float64)
+    assert source.places.dtype == torch.float64
+
+
+def test_a_fresh_process_loads_an_agent_of_such_parts(tmp_path: Path) -> None:
+    file = save_agent(all_parts(), tmp_path / "agent.zip")
+    (tmp_path / "load.py").write_text(LOAD)
+    command = [sys.executable, str(tmp_path / "load.py"), str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    line, config = done.stdout.splitlines()
+    assert "Nearness(width=0.2)" in config
+    for part in ("world_model 'wide'", "reward 'nearness'", "goal_source 'remembered'", "optimizer 'sgd'"):
+        assert f"{part} of the package 'ocwm_example'" in line
+    assert line.endswith(f"install what registers them, or name it in {VARIABLE}")
+
+
+def test_nothing_in_a_description_names_code() -> None:
+    """Only what is registered is built, whatever the description says of packages."""
+    description = describe(all_parts())
+    description["plugins"] = {"reward evil": "os"}
+    description["agent"]["behaviours"]["reach"]["reward"] = {"name": "evil"}
+    with pytest.raises(CheckpointError, match="not registered here: reward 'evil' of the package 'os'"):
+        read_parts(description)
+
+
+def test_a_part_without_a_name_cannot_be_saved(tmp_path: Path) -> None:
+    class Unnamed(type(AGENTS["dreamer_pcp"].behaviours["reach"].reward)):
+        pass
+
+    row = change(AGENTS["dreamer_pcp"], {})
+    reach = Behaviour(row.behaviours["reach"].goal, Unnamed(), row.behaviours["reach"].goals)
+    agent = build_agent(type(row)(row.world_model, {"reach": reach}), reacher_task(), "debug")
+    with pytest.raises(SettingsError, match="Unnamed has no name: put @register"):
+        save_agent(agent, tmp_path / "agent.zip")
+
+
+def test_an_environment_by_its_name() -> None:
+    task = make_task("dots", image_size=24)
+    assert (task.name, task.objects, task.proprio, task.action) == ("dots", ("red", "blue"), 4, 4)
+    assert make_task("ocwm/Dots-v0", image_size=24) == task
+    with closing(make_env("dots", horizon=3)) as env:
+        assert env.rollout(10, break_when_any_done=True)["next", "pixels"].shape == (3, 3, 32, 32)
+    with pytest.raises(SettingsError, match=r"options\.image_size must be at least 8, got 1"):
+        EnvChoice("dots", {"image_size": 1})
+
+
+def test_environments_side_by_side_in_processes_that_know_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    find_environment("dots")
+    monkeypatch.delenv(VARIABLE)
+    with closing(make_env("dots", num_envs=2, horizon=3)) as env:
+        assert env.rollout(2)["pixels"].shape == (2, 2, 3, 32, 32)
+
+
+def test_from_collected_data_to_a_table(tmp_path: Path) -> None:
+    """Collect in workers, train, evaluate in workers: all on the command line."""
+    data, run, output = tmp_path / "data", tmp_path / "run", tmp_path / "evaluation"
+    done = example("collect.py", "env=dots", f"dataset={data}", "steps=60", "workers=1", "env.options.horizon=15")
+    assert "60 steps in 4 episodes" in done.stdout, done.stderr
+    assert EpisodeDataset.open(data).task.name == "dots"
+    training = ("updates=2", "eval_interval=2", "eval_episodes=2", "eval_steps=3", "video_interval=0")
+    reach = ("reward.width=0.3", "goals=remembered", "object=blue")
+    parts = ("agent=nearness", *(f"agent.behaviours.reach.{one}" for one in reach))
+    more = ("size=debug", "size.learning.optimizer=sgd", *(f"training.{one}" for one in training))
+    done = example("train_offline.py", "env=dots", f"dataset={data}", f"output={run}", *parts, *more)
+    assert done.returncode == 0, done.stderr
+    agent = load_agent(run / "checkpoint.zip").agent
+    assert to_dict(agent.config)["behaviours"]["reach"]["reward"] == {"name": "nearness", "width": 0.3}
+    small = ("goals=4", "episode_steps=3", "workers=1", "envs=4", "video_goals=1", f"output={output}")
+    done = example("evaluate.py", f"checkpoint={run / 'checkpoint.zip'}", *small)
+    assert done.returncode == 0, done.stderr
+    results = json.loads((output / "results.json").read_text())
+    name = next(row for row in results["agents"] if row != "random")
+    assert "behaviours.reach.reward.width=0.3" in name
+    assert results["settings"]["object"] == "blue"
+    policy = load_agent(run / "checkpoint.zip")
+    goals = torch.tensor(results["goals"])
+    with EvaluationEnvs(policy.agent.task, episode_steps=3, workers=0, envs=4) as envs:
+        episodes = envs.run(policy, goals)
+    away = (episodes["object_position_true"][:, -1, 1] - goals).norm(dim=-1)
+    scored = torch.tensor(results["agents"][name]["per_goal"][0]["final_distance"])
+    torch.testing.assert_close(scored, away, atol=1e-4, rtol=0)

@@ -1,0 +1,68 @@
+"""Rewards on one scale, whatever their size."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_ocwm.settings import read
+
+Normalization = Literal["none", "scale", "standard"]
+
+
+class StreamingNorm(nn.Module):
+    """Normalise by moments that move along with what is seen.
+
+    Each call in training mode first takes its values into the moments: the mean of all calls so far, until these are
+    ``1 / rate``, and from then on an exponential moving average. In evaluation mode they stay as they are. They are
+    saved with the module. Values that nothing was seen of yet stay as they are. Gradients go through the values, not
+    through the moments.
+
+    Args:
+        mode: ``"standard"`` subtracts the mean and divides by the standard deviation; ``"scale"`` divides by the root
+            mean square, so that signs stay; ``"none"`` changes nothing.
+        rate: Share of the newest values in the moments.
+        epsilon: Smallest divisor.
+
+    Called with values ``[...]``; returns the same shape.
+
+    Raises:
+        ValueError: for another mode.
+
+    Examples:
+        >>> norm = StreamingNorm("standard")
+        >>> norm(torch.tensor([1.0, 3.0])), norm.eval()(torch.tensor([4.0]))
+        (tensor([-1.,  1.]), tensor([2.]))
+    """
+
+    mean: Tensor
+    square: Tensor
+    calls: Tensor
+
+    def __init__(self, mode: Normalization = "standard", *, rate: float = 0.01, epsilon: float = 1e-6) -> None:
+        super().__init__()
+        read(Normalization, mode, "mode")
+        self.mode, self.rate, self.epsilon = mode, rate, epsilon
+        self.register_buffer("mean", torch.zeros(()))
+        self.register_buffer("square", torch.ones(()))
+        self.register_buffer("calls", torch.zeros(()))
+
+    @torch.no_grad()
+    def update(self, values: Tensor) -> None:
+        """Take values ``[...]`` into the moments."""
+        self.calls.add_(1)
+        weight = (1 / self.calls).clamp_min(self.rate)
+        self.mean.lerp_(values.float().mean(), weight)
+        self.square.lerp_(values.float().square().mean(), weight)
+
+    def forward(self, values: Tensor) -> Tensor:
+        if self.training:
+            self.update(values)
+        if self.mode == "scale":
+            return values / self.square.sqrt().clamp_min(self.epsilon)
+        if self.mode == "standard":
+            spread = (self.square - self.mean.square()).clamp_min(self.epsilon**2).sqrt()
+            return (values - self.mean) / spread
+        return values
