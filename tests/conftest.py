@@ -103,7 +103,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def scripts() -> dict[str, ModuleType]:
     """The scripts of the recipes as modules: to run one here saves the seconds that a process takes to start."""
     modules = {}
-    for name in ("collect", "train_offline", "evaluate", "diagnose"):
+    for name in ("collect", "train_offline", "train_online", "evaluate", "diagnose"):
         spec = spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
         assert spec is not None
         assert spec.loader is not None

@@ -60,7 +60,7 @@ collect timeout=nan                                timeout must be a number, got
 collect timeout=soon                               timeout must be a number, got 'soon'
 collect workers=-1                                 workers must be at least 0, got -1
 collect workers=abc                                workers must be a whole number, got 'abc'
-collect +foo=1                                     foo is no setting; there are steps, policy, workers, seed,
+collect +foo=1                                     foo is no setting; there are steps, policy,
 diagnose checkpoint=[a,b]                          checkpoint must be a text, got ['a', 'b']
 diagnose checkpoint=null                           checkpoint must be a text, got None
 diagnose context=50                                context=50 of length=50 frames

@@ -22,7 +22,7 @@ from torchrl_ocwm.envs import Workspace
 from torchrl_ocwm.evaluation import landmarks
 from torchrl_ocwm.settings import change, to_dict
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
-from torchrl_ocwm.training import offline
+from torchrl_ocwm.training import run as runs
 from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import Stepper, make_stepper
@@ -63,7 +63,7 @@ def run(dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             seen.threads.append(torch.get_num_threads())
 
         agent.loss.register_forward_pre_hook(look)
-        save, log, schedule = Archive.save, CSVLogger.log_scalar, offline.make_schedule
+        save, log, schedule = Archive.save, CSVLogger.log_scalar, runs.make_schedule
 
         def note_save(self: Archive, *arguments: Any, **options: Any) -> Path:
             seen.saved.append(len(seen.batches))
@@ -90,7 +90,7 @@ def run(dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         with monkeypatch.context() as patch:
             patch.setattr(Archive, "save", note_save)
             patch.setattr(CSVLogger, "log_scalar", note_log)
-            patch.setattr(offline, "make_schedule", note_rates)
+            patch.setattr(runs, "make_schedule", note_rates)
             training = Training(**{"updates": 4, "eval_interval": 0, "video_interval": 0, **settings})
             folder = folder or tmp_path / f"run_{next(numbers)}"
             train_offline(agent, dataset, folder, training, evaluate=evaluate, film=film, progress=False)
@@ -160,7 +160,7 @@ def test_goals(run: Callable[..., Run], dataset: EpisodeDataset, goals: str) -> 
     torch.manual_seed(0)
     stored = {tuple(goal) for goal in dataset.records["next", "goal_position"].tolist()}
     agent = build_agent("dreamer", TASK, "debug")
-    sample = offline._make_sampler(agent, dataset, Training(goals=goals))  # type: ignore[arg-type]
+    sample = runs.Sampler(agent, dataset, Training(goals=goals))  # type: ignore[arg-type]
     seen = {tuple(goal) for goal in sample()["next", "goal_position"].flatten(0, 1).tolist()}
     assert (seen <= stored) == (goals == "stored")
     assert (seen & stored == set()) == (goals != "stored")
