@@ -1,7 +1,8 @@
 """Train an agent that collects its data: ``python examples/train_online.py agent=focus_lcp env=cube_move size=cpu``.
 
-Can be stopped (Ctrl-C, SIGTERM, killed) and run again: it goes on with the same dataset and checkpoint.
-``train_offline.py`` can train on the dataset at any time.
+``explore=focus_explore`` gives it an explorer, which plays every other episode. Can be stopped (Ctrl-C, SIGTERM,
+killed) and run again: it goes on with the same dataset and checkpoint. ``train_offline.py`` can train on the dataset at
+any time.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class TrainOnline(Settings):
     dataset: str | None = None
 
 
-@recipe("train_online", {"agent": "focus_lcp", "env": "reacher", "size": "cpu"})
+@recipe("train_online", {"agent": "focus_lcp", "explore": "none", "env": "reacher", "size": "cpu"})
 def main(config: TrainOnline) -> None:
     training, folder = config.training, run_folder(config.output)
     name, options = config.env.name, dict(config.env.options)

@@ -16,7 +16,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
+from torchrl_ocwm.agents import AGENTS, EXPLORERS, SIZES, Agent, build_agent
 from torchrl_ocwm.envs import ENVIRONMENTS
 from torchrl_ocwm.parts import Part
 from torchrl_ocwm.settings import change
@@ -37,7 +37,7 @@ def _seed() -> None:
 @pytest.fixture(scope="module")
 def registries() -> Iterator[None]:
     """What the tests of a module register is gone afterwards."""
-    tables: list[dict[str, Any]] = [AGENTS, SIZES, ENVIRONMENTS, *Part.registered.values()]
+    tables: list[dict[str, Any]] = [AGENTS, EXPLORERS, SIZES, ENVIRONMENTS, *Part.registered.values()]
     before = [dict(table) for table in tables]
     yield
     for table, content in zip(tables, before, strict=True):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +21,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.checkpoint import CheckpointError
 
-from torchrl_ocwm.agents import Agent, build_agent, load_agent
+from torchrl_ocwm.agents import AGENTS, EXPLORERS, Agent, build_agent, load_agent
+from torchrl_ocwm.agents.archive import Archive
 from torchrl_ocwm.data import EpisodeDataset
 from torchrl_ocwm.envs import make_task
 from torchrl_ocwm.settings import SettingsError
@@ -34,7 +37,8 @@ HORIZON = 10
 OPTIONS = {"image_size": 16, "horizon": HORIZON}
 TRAINING = Training(updates=8, log_interval=1, checkpoint_interval=100, eval_interval=2)
 ONLINE = Online(seed_steps=(20,), seed_updates=2, update_ratio=0.1, round_episodes=2, workers=0)
-EXAMPLES = Path(__file__).parents[2] / "examples"
+ROOT = Path(__file__).parents[2]
+ZIP = "checkpoint.zip"
 
 
 def fresh(name: str = "dreamer_pcp") -> Agent:
@@ -249,14 +253,9 @@ class TestRun:
         assert run(tmp_path).num_steps == 20 + 40  # two updates more on the seed steps, then three
 
 
-ZIP = "checkpoint.zip"
-
-
 def updates(folder: Path) -> int:
     counts: dict[str, Any] = {}
     state = SimpleNamespace(state_dict=dict, load_state_dict=counts.update)
-    from torchrl_ocwm.agents.archive import Archive
-
     Archive(trainer_state=state).load(folder / ZIP)
     return counts["collected_frames"]
 
@@ -300,10 +299,19 @@ class TestPlayer:
         ):
             player.play_round()
 
-    def test_behaviours_and_their_counts(self, player: Player) -> None:
-        player.behaviours = ("reach", "explore")
-        player.play_round()
-        assert player.dataset.metadata["policies"] == {"random": 2, "reach": 1, "explore": 1}
+    @pytest.mark.parametrize(
+        ("behaviours", "counts"), [((), {"reach": 1, "explore": 1}), (("explore",), {"explore": 2})]
+    )
+    def test_behaviours_take_turns(self, player: Player, behaviours: tuple[str, ...], counts: dict[str, int]) -> None:
+        config = AGENTS["dreamer_pcp"].and_behaviours(explore=EXPLORERS["plan2explore"])
+        agent = build_agent(config, make_task("reacher", image_size=16), "debug")
+        explorer = Player(agent, player.dataset, replace(ONLINE, behaviours=behaviours), seed=0)
+        explorer.stop = player.stop
+        explorer.play_round()
+        explorer.close()
+        assert player.dataset.metadata["policies"] == {"random": 2, **counts}
+
+    def test_unknown_behaviour(self, player: Player) -> None:
         with pytest.raises(ValueError, match="unknown behaviour 'dance'"):
             Player(fresh(), player.dataset, replace(ONLINE, behaviours=("dance",)), seed=0)
 
@@ -416,7 +424,7 @@ def test_the_recipe_goes_on_after_a_signal(tmp_path: Path, number: signal.Signal
     settings = ["size=debug", "env.options.image_size=16", f"env.options.horizon={HORIZON}", f"output={tmp_path}"]
     settings += ["training.eval_interval=0", "training.video_interval=0", "training.checkpoint_interval=1"]
     settings += ["online.seed_steps=[20]", "online.seed_updates=2", f"online.collector={collector}", "online.workers=1"]
-    command = [sys.executable, str(EXAMPLES / "train_online.py"), *settings]
+    command = [sys.executable, str(ROOT / "examples" / "train_online.py"), *settings]
     with subprocess.Popen(
         [*command, "training.updates=100000"], stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
@@ -443,3 +451,28 @@ def test_the_recipe_goes_on_after_a_signal(tmp_path: Path, number: signal.Signal
     assert len(after) > len(before)
     assert torch.equal(after.records["action"][: len(before.records)], before.records["action"])
     assert after.metadata["coverage"]
+
+
+def documented_command() -> list[str]:
+    page = (ROOT / "docs" / "howto.md").read_text()
+    found = re.search(r"^python (examples/train_online\.py agent=.*?)\n```", page, re.DOTALL | re.MULTILINE)
+    assert found is not None
+    return shlex.split(found[1].replace("\\\n", ""))
+
+
+@pytest.mark.slow
+def test_the_documented_command(tmp_path: Path) -> None:
+    """In small: Cube move, scripted and random seed steps, then rounds."""
+    small = ["size=debug", "env.options.image_size=16", "env.options.mask_scale=1", "env.options.horizon=10"]
+    small += ["training.updates=4", "training.eval_interval=0", "training.video_interval=0", f"output={tmp_path}"]
+    small += ["online.seed_steps=[10,10]", "online.seed_updates=2", "online.update_ratio=0.1"]
+    small += ["online.round_episodes=1", "online.workers=0"]
+    subprocess.run([sys.executable, *documented_command(), *small], check=True, cwd=ROOT, capture_output=True)
+    dataset = EpisodeDataset.open(tmp_path / "data", verify=True)
+    assert dataset.metadata["policies"] == {"scripted": 1, "random": 1, "reach": 2}
+    assert updates(tmp_path) == 4
+
+
+def test_every_setting_is_documented() -> None:
+    page = (ROOT / "docs" / "howto.md").read_text()
+    assert [one.name for one in fields(Online) if f"`online.{one.name}`" not in page] == []

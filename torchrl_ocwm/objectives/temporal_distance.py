@@ -180,7 +180,7 @@ class TemporalDistanceLoss(LossModule):
         return TensorDict(
             {
                 "loss_embedding": self._embedding_error(records["next"].detach()),
-                "loss_temporal_distance": self._distance_error(imagined.detach(), *records.batch_size),
+                "loss_temporal_distance": self._distance_error(imagined, *records.batch_size),
             }
         )
 

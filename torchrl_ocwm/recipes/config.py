@@ -167,8 +167,8 @@ def _without_leftovers(values: Any, row: Any) -> Any:
         return values
     if values.get("name") == row.get("name"):
         return {name: _without_leftovers(value, row.get(name)) for name, value in values.items()}
-    parts = [part for kind in Part.registered.values() for name, part in kind.items() if name == values.get("name")]
-    known = {one.name for part in parts for one in fields(part)}
+    named: list[Any] = [kind.get(str(values.get("name"))) for kind in Part.registered.values()]
+    known = {one.name for part in named if part is not None for one in fields(part)}
     return {name: value for name, value in values.items() if name in known or row.get(name) != value}
 
 

@@ -20,13 +20,14 @@ from torchrl_ocwm.data.collect import STORED, check_failures, collect, count_epi
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs import find_environment, make_env
+from torchrl_ocwm.settings import from_dict
 from torchrl_ocwm.training.collectors import NUMBER, Turns, end, make_collector, next_episodes
 from torchrl_ocwm.training.hooks import ProgressBar, StopOnSignals, UpdateClock
 from torchrl_ocwm.training.run import CHECKPOINT, SHOWN, Evaluate, Film, Run, check_task, own
 from torchrl_ocwm.training.settings import Online, Training
 
 _NEXT = "next_online_episode"
-_CHUNK = 250  # steps at a time, of an environment whose episodes have no fixed length
+_CHUNK = 100  # steps that a process plays before it reports, where an environment has no horizon
 
 
 def collect_seed_steps(
@@ -229,9 +230,9 @@ class Player:
 
     def _start(self) -> None:
         index = self.dataset.metadata
-        name, options = index["environment"], index["options"]
-        make = partial(make_env, name, **{**options, "privileged": True})
-        chunk = options.get("horizon", getattr(find_environment(name).options(), "horizon", _CHUNK))
+        environment, options = find_environment(index["environment"]), index["options"]
+        make = partial(make_env, environment, **{**options, "privileged": True})
+        chunk = getattr(from_dict(environment.options, options), "horizon", _CHUNK)
         # Numbers of episodes that failed are not tried again: they may fail again.
         first = index.get(_NEXT, 0) + self._failures * max(self.online.workers, 1)
         self._collector = make_collector(make, self._acting, self.online, first=first, chunk=chunk)
