@@ -166,3 +166,20 @@ def cube_move_sentences() -> list[str]:
 )
 def test_sentence(name: str, sentence: str) -> None:
     assert sentence in page(name)
+
+
+def test_goals_of_one_length() -> None:
+    """The table, cell by cell."""
+    text = page("reacher")
+    scores = {}
+    for when, commit in (("before", "8937f01"), ("after", "2978348")):
+        numbers = json.loads((RESULTS / "reacher" / "goal_length" / f"{when}.json").read_text())["agents"]
+        for row, goals in (("focus_lcp", "positions"), ("focus_lcp, image goals", "images")):
+            means = {name: metric["mean"] for name, metric in numbers[row]["metrics"].items() if metric is not None}
+            scores[when, goals] = round(means["final_score"], 2)
+            cells = (f"{means['final_score']:.2f}", f"{means['success']:.2f}", f"{means['final_distance']:.3f}")
+            label = f"{commit}, {when}" if goals == "positions" else ""
+            assert f"| {label} | {goals} | {' | '.join(cells)} |".replace("|  |", "| |") in text
+    lost = {when: scores[when, "positions"] - scores[when, "images"] for when in ("before", "after")}
+    assert f"Images lost {lost['before']:.2f} to positions before, and lose {lost['after']:.2f} after" in text
+    assert f"positions have {scores['before', 'positions'] - scores['after', 'positions']:.2f} less" in text
