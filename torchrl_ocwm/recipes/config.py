@@ -155,7 +155,7 @@ def _given(config: DictConfig) -> dict[str, Any]:
         raise SettingsError(f"{lacking[0]} is missing; give it, as in {lacking[0]}=...")
     values: Any = OmegaConf.to_container(config, resolve=True)
     choices = HydraConfig.get().runtime.choices
-    rows = {group: to_dict(known.get(choices.get(group))) for group, known in (("agent", AGENTS), ("size", SIZES))}
+    rows = {group: to_dict(known.get(str(choices.get(group)))) for group, known in (("agent", AGENTS), ("size", SIZES))}
     if rows["agent"] and choices.get("explore") in EXPLORERS:
         rows["agent"]["behaviours"][EXPLORE] = to_dict(EXPLORERS[choices["explore"]])
     return {name: _without_leftovers(value, rows.get(name)) for name, value in values.items()}
