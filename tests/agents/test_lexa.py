@@ -258,3 +258,16 @@ def test_steps_to_goals_of_other_kinds(name: str, changes: dict[str, Any]) -> No
     assert loss.reward_loss.head(torch.zeros(1, 16), torch.zeros(1, 16)).shape[-1] == agent.behaviour().goal.features
     assert losses["loss_embedding"] > 0
     assert trained(agent, [losses["loss_actor"]]) == {"actor"}
+
+
+def test_first_frames_may_be_marked_by_another_key(make_agent: Any, records: TensorDict) -> None:
+    agent = make_agent("dreamer_pcp", {f"{REACH}.goals": "future"})
+    torch.manual_seed(1)
+    expected = goals_in_imagination(agent, records)
+    source = agent.behaviour().loss.goal_source
+    agent.behaviour().loss.goal_source = FutureGoals(source.frames, mean_offset=source.mean_offset, is_init="start")
+    agent.loss.set_keys(is_init="start")
+    records["start"] = records["is_init"].clone()
+    assert "start" in agent.loss.in_keys
+    torch.manual_seed(1)
+    torch.testing.assert_close(goals_in_imagination(agent, records), expected)

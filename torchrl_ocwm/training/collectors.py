@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.util import find_spec
 from itertools import count
-from threading import Timer
+from threading import Thread, Timer
 from typing import Any
 
 import torch
@@ -85,7 +86,7 @@ def make_collector(
 
     Args:
         make: Makes an environment.
-        policy: Acts; its weights reach other processes by ``update_policy_weights_``.
+        policy: Acts; its weights reach other processes by :func:`send_weights`.
         online: Which collector, and how many processes.
         first: Number of the first episode.
         chunk: Steps after which a worker reports.
@@ -114,6 +115,32 @@ def make_collector(
             num_threads=torch.get_num_threads(),  # of this process, which updates
             **whole,
         )
+
+
+def send_weights(collector: BaseCollector, timeout: float) -> None:
+    """Let a collector's processes act with the weights that its policy has now.
+
+    Raises:
+        RuntimeError: if a process has ended or hangs.
+    """
+    failed: list[Exception] = []
+
+    def send() -> None:
+        try:
+            collector.update_policy_weights_()
+        except Exception as error:  # raised below
+            failed.append(error)
+
+    # TorchRL waits without end for the answer of a process that has ended.
+    sending = Thread(target=send, daemon=True)
+    sending.start()
+    until = time.monotonic() + timeout
+    while sending.is_alive():
+        sending.join(0.1)
+        if time.monotonic() > until or not all(process.is_alive() for process in getattr(collector, "procs", ())):
+            raise RuntimeError("a process that plays has ended, or does not take new weights")
+    if failed:
+        raise RuntimeError(f"new weights have not reached the processes that play ({failed[0]})") from failed[0]
 
 
 def next_episodes(batches: Iterator[TensorDictBase], collector: BaseCollector, timeout: float) -> list[TensorDictBase]:

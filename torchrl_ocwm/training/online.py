@@ -21,7 +21,7 @@ from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs import find_environment, make_env
 from torchrl_ocwm.settings import from_dict
-from torchrl_ocwm.training.collectors import NUMBER, Turns, end, make_collector, next_episodes
+from torchrl_ocwm.training.collectors import NUMBER, Turns, end, make_collector, next_episodes, send_weights
 from torchrl_ocwm.training.hooks import ProgressBar, StopOnSignals, UpdateClock
 from torchrl_ocwm.training.run import CHECKPOINT, SHOWN, Evaluate, Film, Run, check_task, own
 from torchrl_ocwm.training.settings import Online, Training
@@ -184,6 +184,7 @@ class Player:
         self._acting = Turns(copy, self.behaviours, seed=seed)
         self._collector: BaseCollector | None = None
         self._batches: Iterator[TensorDictBase] = iter(())
+        self._sent = False
         self._failures = 0
         self._played: dict[str, float] = {}
 
@@ -194,8 +195,7 @@ class Player:
             CollectionError: if one episode after the other fails.
         """
         self._acting.load_state_dict(self._learning.state_dict())
-        if self._collector is not None:
-            self._collector.update_policy_weights_()
+        self._sent = False
         rewards: list[float] = []
         while len(rewards) < self.online.round_episodes and not self.stop.stopped:
             for episode in self.stop.look(self._next_episodes) or ():
@@ -221,6 +221,9 @@ class Player:
             if self._collector is None:
                 self._start()
             assert self._collector is not None
+            if not self._sent:
+                send_weights(self._collector, self.online.timeout)
+                self._sent = True
             return next_episodes(self._batches, self._collector, self.online.timeout)
         except RuntimeError as error:  # of a simulator, or of a process that died or hangs
             self._failures += 1
@@ -236,8 +239,7 @@ class Player:
         # Numbers of episodes that failed are not tried again: they may fail again.
         first = index.get(_NEXT, 0) + self._failures * max(self.online.workers, 1)
         self._collector = make_collector(make, self._acting, self.online, first=first, chunk=chunk)
-        self._collector.update_policy_weights_()
-        self._batches = iter(self._collector)
+        self._batches, self._sent = iter(self._collector), False
 
     def _append(self, episode: TensorDictBase) -> None:
         number = int(episode[NUMBER][0])
