@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torchrl_ocwm.agents import collecting_policy
 from torchrl_ocwm.data.collect import collect
 from torchrl_ocwm.data.settings import Collection
-from torchrl_ocwm.envs.registry import EnvChoice
+from torchrl_ocwm.envs import EnvChoice, make_task
 from torchrl_ocwm.recipes import recipe
 from torchrl_ocwm.signals import ended_by_signals
 
@@ -33,7 +34,9 @@ class Collect(Collection):
 @recipe("collect", {"env": "reacher"})
 @ended_by_signals()
 def main(config: Collect) -> None:
-    dataset = collect(config.dataset, config.env.name, config, options=dict(config.env.options))
+    options = dict(config.env.options)
+    policy = collecting_policy(config, make_task(config.env.name, **options))
+    dataset = collect(config.dataset, config.env.name, config, policy=policy, options=options)
     index = dataset.metadata
     policies = ", ".join(f"{number} {policy}" for policy, number in index.get("policies", {}).items())
     print(f"{dataset.path}: {dataset.num_steps} steps in {len(dataset.episode_lengths)} episodes ({policies})")

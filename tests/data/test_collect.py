@@ -13,10 +13,10 @@ from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from torchrl_ocwm import build_agent, save_agent
-from torchrl_ocwm.agents import AGENTS, EXPLORERS
+from torchrl_ocwm.agents import AGENTS, EXPLORERS, collecting_policy
 from torchrl_ocwm.agents.checkpoint import describe
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, ScriptedPolicy, SmoothRandomPolicy, object_coverage
-from torchrl_ocwm.data.collect import CollectionError, EpisodePlayer, collect, make_policy
+from torchrl_ocwm.data.collect import CollectionError, EpisodePlayer, collect
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import Reacher, SimulationDivergedError, Task, make_task
 from torchrl_ocwm.errors import UserError
@@ -32,6 +32,7 @@ def gather(path, steps, *, options=OPTIONS, policy="random", **settings):
     module = policy if isinstance(policy, TensorDictModuleBase) else None
     names = {} if module is not None else {"policy": str(policy)}
     settings = Collection(**{"steps": steps, "workers": 0, **names, **settings})
+    module = module or collecting_policy(settings, make_task("reacher", **options))
     return collect(path, "reacher", settings, policy=module, options=options, progress=False)
 
 
@@ -250,6 +251,11 @@ def test_checkpoint_as_policy(tmp_path):
         gather(tmp_path / "other", 20, policy=checkpoint, options=other)
 
 
+def test_a_policy_has_to_be_handed_in_unless_it_has_a_name(tmp_path, no_collector):
+    with pytest.raises(SettingsError, match="is handed in as a module"):
+        collect(tmp_path / "data", "reacher", Collection(steps=20, policy="agent.zip"), options=OPTIONS)
+
+
 def test_unknown_policy(tmp_path, no_collector):
     with pytest.raises(SettingsError, match="policy must be random, scripted or a checkpoint file, got 'rnd'"):
         gather(tmp_path / "data", 20, policy="rnd")
@@ -380,9 +386,8 @@ def test_which_behaviour_collects(tmp_path):
     task = make_task("reacher", **OPTIONS)
     row = AGENTS["dreamer_pcp"].and_behaviours(explore=EXPLORERS["plan2explore"])
     file = save_agent(build_agent(row, task, "debug"), tmp_path / "agent.zip")
-    for behaviour, name in (("explore", f"{file} (explore)"), (None, str(file))):
-        shown, policy = make_policy(file, task, behaviour)
-        assert shown == name
+    for behaviour in ("explore", None):
+        policy = collecting_policy(Collection(policy=str(file), behaviour=behaviour), task)
         assert policy.behaviour is policy.agent.behaviours[behaviour or "reach"]
     found = gather(tmp_path / "data", 20, policy=file, behaviour="explore")
     assert found.metadata["policies"] == {f"{file} (explore)": 1}

@@ -15,7 +15,7 @@ import torch
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_ocwm import build_agent, load_agent, make_env, make_task
-from torchrl_ocwm.agents import AGENTS, SIZES, Agent, Behaviour, save_agent
+from torchrl_ocwm.agents import AGENTS, SIZES, Agent, Behaviour, collecting_policy, save_agent
 from torchrl_ocwm.agents.checkpoint import describe, read_parts
 from torchrl_ocwm.data import EpisodeDataset
 from torchrl_ocwm.data.collect import collect
@@ -203,5 +203,7 @@ def test_from_collected_data_to_a_table(tmp_path: Path) -> None:
     torch.testing.assert_close(scored, away, atol=1e-4, rtol=0)
     # The agent collects in a process of its own.
     more = Collection(steps=75, policy=str(run / "checkpoint.zip"), workers=1)
-    with collect(data, "dots", more, options=EpisodeDataset.open(data).metadata["options"], progress=False) as dataset:
+    options = EpisodeDataset.open(data).metadata["options"]
+    acts = collecting_policy(more, policy.agent.task)
+    with collect(data, "dots", more, policy=acts, options=options, progress=False) as dataset:
         assert list(dataset.metadata["policies"].values()) == [4, 1]

@@ -13,7 +13,7 @@ import torch
 from rows import shows
 from tensordict import TensorDictBase
 
-from torchrl_ocwm.agents import AGENTS, EXPLORERS, Agent, build_agent, save_agent
+from torchrl_ocwm.agents import AGENTS, EXPLORERS, Agent, build_agent, collecting_policy, save_agent
 from torchrl_ocwm.agents.presets import AgentConfig
 from torchrl_ocwm.data import EpisodeDataset
 from torchrl_ocwm.data.collect import collect
@@ -132,7 +132,9 @@ def test_a_behaviour_collects(tmp_path: Path, checkpoint: Path) -> None:
     actions = []
     for behaviour in (None, "reach", "explore"):
         settings = Collection(steps=10, policy=str(checkpoint), behaviour=behaviour, workers=0)
-        dataset = collect(tmp_path / str(behaviour), "reacher", settings, options=OPTIONS, progress=False)
+        policy = collecting_policy(settings, make_task("reacher", **OPTIONS))
+        folder = tmp_path / str(behaviour)
+        dataset = collect(folder, "reacher", settings, policy=policy, options=OPTIONS, progress=False)
         assert dataset.metadata["policies"] == {f"{checkpoint} ({behaviour})" if behaviour else str(checkpoint): 1}
         actions.append(dataset.records["action"].clone())
     assert torch.equal(actions[0], actions[1])

@@ -15,6 +15,8 @@ from torchrl_ocwm.agents.agent import Agent, Policy
 from torchrl_ocwm.agents.archive import Archive, read_manifest
 from torchrl_ocwm.agents.config import AgentConfig, Size
 from torchrl_ocwm.agents.presets import flat
+from torchrl_ocwm.data.policies import POLICIES
+from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.parts import VARIABLE, absent, foreign
@@ -68,6 +70,30 @@ def load_agent(path: str | Path, *, behaviour: str | None = None, device: torch.
     Archive(loss_module=agent.loss).load(path, map_location="cpu")
     agent.to(device).eval().requires_grad_(False)
     return agent.policy(behaviour)
+
+
+def collecting_policy(settings: Collection, task: Task) -> Policy | None:
+    """The policy that collects, where its settings name the checkpoint of an agent; ``None`` for a policy by name.
+
+    Args:
+        settings: The collection's, with the checkpoint under ``policy``.
+        task: The task that is collected for.
+
+    Raises:
+        SettingsError: if there is no such file, it is of another task's agent, or the agent lacks the behaviour.
+        CheckpointError: for a file that is no checkpoint of an agent.
+    """
+    if settings.policy in POLICIES:
+        return None
+    if not Path(settings.policy).is_file():
+        raise SettingsError(f"policy must be {', '.join(POLICIES)} or a checkpoint file, got {settings.policy!r}")
+    policy = load_agent(settings.policy, behaviour=settings.behaviour)
+    if policy.agent.task != task:
+        raise SettingsError(
+            f"policy={settings.policy}: the agent was trained for {policy.agent.task.name!r} with options "
+            f"{policy.agent.task.options}, not for {task.name!r} with {task.options}"
+        )
+    return policy
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_ocwm.agents.checkpoint import load_agent
 from torchrl_ocwm.data.coverage import dataset_coverage
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
-from torchrl_ocwm.data.policies import ScriptedPolicy, SmoothRandomPolicy
+from torchrl_ocwm.data.policies import POLICIES, ScriptedPolicy
 from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
 from torchrl_ocwm.data.settings import Collection
@@ -62,8 +61,6 @@ STORED = (
 )
 
 
-#: Policies by name; a checkpoint is the third kind.
-POLICIES: dict[str, Callable[[int], TensorDictModuleBase]] = {"random": SmoothRandomPolicy, "scripted": ScriptedPolicy}
 #: So many episodes in a row may fail.
 MAX_FAILURES = 3
 
@@ -97,7 +94,8 @@ def collect(
         path: Folder of the dataset.
         environment: Name of the environment (:data:`~torchrl_ocwm.envs.ENVIRONMENTS`).
         settings: How much, by whom and how; or the steps, with other settings as arguments.
-        policy: A module that writes ``action``, in place of ``settings.policy``.
+        policy: A module that writes ``action``: that which ``settings.policy`` names, if it is a checkpoint
+            (:func:`~torchrl_ocwm.agents.collecting_policy`), or another in its place.
         options: Passed to the environment.
         progress: Show a progress bar with the rate.
         more: Fields of :class:`~torchrl_ocwm.data.settings.Collection`, where ``settings`` is a number of steps.
@@ -107,8 +105,7 @@ def collect(
 
     Raises:
         DatasetError: if the folder holds a dataset of another environment or other options, or cannot be written.
-        SettingsError: for an unknown policy, or a checkpoint of another task's agent.
-        CheckpointError: for a file that is no checkpoint of an agent.
+        SettingsError: for an unknown policy.
         WorkerError: if a process ends before it has begun.
         CollectionError: if one episode after the other fails, in the simulator or with its process. What fails
             otherwise is raised as a ``RuntimeError``.
@@ -118,7 +115,7 @@ def collect(
     options = options or {}
     task = make_task(environment, **options)
     source = {"environment": task.name, "options": options, "task": task.to_dict()}
-    name, module = make_policy(settings.policy if policy is None else policy, task, settings.behaviour)
+    name, module = _who_acts(settings, policy, task)
     dataset = _open_if_there(Path(path), source)
     if dataset is not None and dataset.num_steps >= settings.steps:
         with dataset:
@@ -147,28 +144,20 @@ def collect(
         return with_coverage(dataset, task)
 
 
-def make_policy(
-    policy: str | Path | TensorDictModuleBase, task: Task, behaviour: str | None = None
+def _who_acts(
+    settings: Collection, policy: TensorDictModuleBase | None, task: Task
 ) -> tuple[str, TensorDictModuleBase]:
-    """A policy's name in the index of a dataset, and the module that acts: of an agent, one of its behaviours.
-
-    Raises:
-        SettingsError: for an unknown name, a checkpoint of another task's agent, or a behaviour that it does not have.
-        CheckpointError: for a file that is no checkpoint of an agent.
-    """
-    if isinstance(policy, TensorDictModuleBase):
+    """A policy's name in the index of a dataset, and the module that acts."""
+    if policy is None:
+        if settings.policy not in POLICIES:
+            raise SettingsError(
+                f"policy must be {', '.join(POLICIES)} or a checkpoint file, got {settings.policy!r}; that of a "
+                "checkpoint is handed in as a module (torchrl_ocwm.agents.collecting_policy)"
+            )
+        return settings.policy, POLICIES[settings.policy](task.action)
+    if settings.policy in POLICIES:
         return type(policy).__name__, policy
-    if policy in POLICIES:
-        return str(policy), POLICIES[str(policy)](task.action)
-    if not Path(policy).is_file():
-        raise SettingsError(f"policy must be {', '.join(POLICIES)} or a checkpoint file, got {str(policy)!r}")
-    loaded = load_agent(policy, behaviour=behaviour)
-    if loaded.agent.task != task:
-        raise SettingsError(
-            f"policy={policy}: the agent was trained for {loaded.agent.task.name!r} with options "
-            f"{loaded.agent.task.options}, not for {task.name!r} with {task.options}"
-        )
-    return f"{policy} ({behaviour})" if behaviour else str(policy), loaded
+    return f"{settings.policy} ({settings.behaviour})" if settings.behaviour else settings.policy, policy
 
 
 class EpisodePlayer:

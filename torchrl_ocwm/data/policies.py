@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -128,3 +130,7 @@ class ScriptedPolicy(TensorDictModuleBase):
         tensordict.set(self.out_keys[1], in_stretch)
         tensordict.set(self.out_keys[2], level)
         return tensordict.set(self.out_keys[0], action)
+
+
+#: Collecting policies by name, each made for a number of actions.
+POLICIES: dict[str, Callable[[int], TensorDictModuleBase]] = {"random": SmoothRandomPolicy, "scripted": ScriptedPolicy}

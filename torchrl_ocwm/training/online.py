@@ -14,12 +14,12 @@ from torchrl.collectors import BaseCollector
 from torchrl.trainers.algorithms import DreamerV3UpdateRatio
 
 from torchrl_ocwm.agents.agent import Agent
-from torchrl_ocwm.agents.checkpoint import describe, rebuild
+from torchrl_ocwm.agents.checkpoint import collecting_policy, describe, rebuild
 from torchrl_ocwm.data import EpisodeDataset, episode_to_records
 from torchrl_ocwm.data.collect import STORED, check_failures, collect, count_episode
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.devices import usable_device
-from torchrl_ocwm.envs import find_environment, make_env
+from torchrl_ocwm.envs import find_environment, make_env, make_task
 from torchrl_ocwm.settings import from_dict
 from torchrl_ocwm.training.collectors import NUMBER, Turns, end, make_collector, next_episodes, send_weights
 from torchrl_ocwm.training.hooks import ProgressBar, StopOnSignals, UpdateClock
@@ -59,7 +59,8 @@ def collect_seed_steps(
     shared = Collection(seed=seed, workers=online.workers, timeout=online.timeout)
     for policy, steps in zip(online.seed_policy, accumulate(online.seed_steps), strict=True):
         settings = replace(shared, policy=policy, steps=steps)
-        collect(path, environment, settings, options=options, progress=progress)
+        acts = collecting_policy(settings, make_task(environment, **(options or {})))
+        collect(path, environment, settings, policy=acts, options=options, progress=progress)
     return EpisodeDataset.open(path, write=True)
 
 
