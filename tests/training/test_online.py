@@ -6,6 +6,7 @@ import csv
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -46,10 +47,22 @@ def fresh(name: str = "dreamer_pcp") -> Agent:
     return build_agent(name, make_task("reacher", image_size=16), "debug")
 
 
+SEEDS: dict[str, Path] = {}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _seed_steps(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Collected once, as long as a test has no others."""
+    SEEDS["data"] = tmp_path_factory.mktemp("seeds") / "data"
+    collect_seed_steps(SEEDS["data"], "reacher", ONLINE, options=OPTIONS, progress=False).close()
+
+
 def run(
     folder: Path, agent: Agent | None = None, training: Training = TRAINING, online: Online = ONLINE, **kwargs: Any
 ) -> EpisodeDataset:
     agent = fresh() if agent is None else agent
+    if online.seed_policy == ONLINE.seed_policy and not (folder / "data").exists():
+        shutil.copytree(SEEDS["data"], folder / "data")
     with collect_seed_steps(folder / "data", "reacher", online, options=OPTIONS, progress=False) as dataset:
         train_online(agent, dataset, folder, training, online, progress=False, **kwargs)
     return dataset
@@ -263,7 +276,8 @@ def updates(folder: Path) -> int:
 class TestPlayer:
     @pytest.fixture
     def player(self, tmp_path: Path) -> Iterator[Player]:
-        with collect_seed_steps(tmp_path / "data", "reacher", ONLINE, options=OPTIONS, progress=False) as dataset:
+        shutil.copytree(SEEDS["data"], tmp_path / "data")
+        with EpisodeDataset.open(tmp_path / "data", write=True) as dataset:
             player = Player(fresh(), dataset, ONLINE, seed=0)
             player.stop = SimpleNamespace(stopped=False, look=lambda function: function())
             yield player
@@ -290,6 +304,18 @@ class TestPlayer:
         player.play_round()
         assert player.dataset.metadata["failures"] == 1
         assert player.dataset.metadata["next_online_episode"] == 5
+
+    @pytest.mark.slow
+    def test_a_process_that_was_killed_is_replaced(self, player: Player) -> None:
+        player.online = replace(ONLINE, workers=1, round_episodes=1)
+        player.play_round()
+        assert player._collector is not None
+        (process,) = player._collector.procs
+        os.kill(process.pid, signal.SIGKILL)
+        with pytest.warns(RuntimeWarning, match="a process that plays has ended"):
+            player.play_round()
+        assert len(player.dataset) == 4
+        assert player.dataset.metadata["failures"] == 1
 
     def test_failures_in_a_row_end_it(self, player: Player, monkeypatch: pytest.MonkeyPatch) -> None:
         self.fail_at(monkeypatch, *range(10))
