@@ -212,6 +212,14 @@ class TestRun:
         assert torch.equal(*(data.records["next", "pixels"][seeds : seeds + 1] for data in (one, other)))
         assert not torch.equal(*(data.records["action"][seeds + 1 : seeds + 2] for data in (one, other)))
 
+    def test_the_seed_of_training_is_that_of_the_episodes(self, tmp_path: Path) -> None:
+        goals = []
+        for seed in (0, 1):
+            training = replace(TRAINING, updates=3, seed=seed)
+            records = run(tmp_path / str(seed), training=training).records["next"]
+            goals.append(records["goal_position"][2 * (HORIZON + 1) :: HORIZON + 1])
+        assert not torch.isclose(*goals).all(-1).any()
+
     def test_a_signal_breaks_a_round_off(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """The episodes that were whole are kept, the update before is saved."""
         played: list[int] = []
