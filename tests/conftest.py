@@ -3,8 +3,11 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterator, Mapping
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -13,11 +16,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
+from torchrl_ocwm.agents import AGENTS, EXPLORERS, SIZES, Agent, build_agent
 from torchrl_ocwm.envs import ENVIRONMENTS
 from torchrl_ocwm.parts import Part
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records, reacher_task
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+#: What a command of a recipe has to say, whatever else it says.
+REQUIRED = {"evaluate": ["checkpoint=a.zip"], "diagnose": ["checkpoint=a.zip", "dataset=data"]}
 
 collect_ignore = ["plugin/ocwm_example"]  # a package that the tests import when they want its parts
 
@@ -30,7 +37,7 @@ def _seed() -> None:
 @pytest.fixture(scope="module")
 def registries() -> Iterator[None]:
     """What the tests of a module register is gone afterwards."""
-    tables: list[dict[str, Any]] = [AGENTS, SIZES, ENVIRONMENTS, *Part.registered.values()]
+    tables: list[dict[str, Any]] = [AGENTS, EXPLORERS, SIZES, ENVIRONMENTS, *Part.registered.values()]
     before = [dict(table) for table in tables]
     yield
     for table, content in zip(tables, before, strict=True):
@@ -90,3 +97,41 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip("cannot mount a file system here")
     yield folder
     subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.fixture(scope="session")
+def scripts() -> dict[str, ModuleType]:
+    """The scripts of the recipes as modules: to run one here saves the seconds that a process takes to start."""
+    modules = {}
+    for name in ("collect", "train_offline", "train_online", "evaluate", "diagnose"):
+        spec = spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+        assert spec is not None
+        assert spec.loader is not None
+        modules[name] = sys.modules[spec.name] = module_from_spec(spec)
+        spec.loader.exec_module(modules[name])
+    return modules
+
+
+@pytest.fixture
+def command(
+    scripts: dict[str, ModuleType],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> Callable[..., str]:
+    """Run a script with arguments in an empty folder; what it says if it ends with an error, or what it prints."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(script: str, *arguments: str) -> str:
+        names = {argument.partition("=")[0] for argument in arguments}
+        required = [one for one in REQUIRED.get(script, []) if one.partition("=")[0] not in names]
+        monkeypatch.setattr(sys, "argv", [f"{script}.py", *required, *arguments])
+        try:
+            scripts[script].main()
+        except SystemExit as stop:
+            printed = capsys.readouterr()
+            said = printed.err if stop.code else printed.out
+            return stop.code if isinstance(stop.code, str) else said
+        return capsys.readouterr().out
+
+    return run

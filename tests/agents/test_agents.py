@@ -42,6 +42,12 @@ def test_every_row_learns_and_acts(name: str) -> None:
     assert policy(step)["action"].shape == (2, task.action)
 
 
+def test_a_fresh_critic_expects_nothing() -> None:
+    critic = build_agent("dreamer_pcp", reacher_task(), "debug").behaviour().loss.actor_loss.value_model
+    latent = {"state": torch.rand(5, 16), "belief": torch.randn(5, 16), "goal": torch.randn(5, 2)}
+    assert critic(TensorDict({"latent": TensorDict(latent, [5])}, [5]))["state_value"].abs().max() == 0
+
+
 def test_who_sees_the_goal() -> None:
     """Dreamer's world model, PCP's actor and critic."""
     dreamer, pcp = (build_agent(name, reacher_task(), "debug") for name in ("dreamer", "dreamer_pcp"))

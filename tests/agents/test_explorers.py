@@ -200,7 +200,7 @@ def test_settings_change_the_reward(explorer: str, name: str, value: Any) -> Non
 def test_what_the_ensemble_predicts(target: str, key: str) -> None:
     agent = beside("plan2explore", {f"{REWARD}.target": target})
     loss = agent.behaviour("explore").loss.reward_loss
-    assert ("records", "next", key) in loss.in_keys
+    assert loss.tensor_keys.target == key
     after = agent.model.records()(random_records(reacher_task(), 2, 3))["next", key]
     assert loss.ensemble(*zeros(agent)).shape[-1] == after.shape[-1]
 

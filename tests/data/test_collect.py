@@ -143,6 +143,8 @@ def test_another_seed_makes_other_episodes(tmp_path, collected):
     other = gather(tmp_path / "data", 20, seed=4).records
     assert not torch.equal(other["action"], collected.records["action"][:21])
     assert not torch.equal(other["next", "proprio"][0], collected.records["next", "proprio"][0])
+    starts = collected.records["next", "proprio"][collected.records["is_init"].squeeze(-1)]
+    assert len(starts.unique(dim=0)) == len(collected.episode_lengths)  # each number makes another one
 
 
 def test_random_numbers_around_it_stay(tmp_path):

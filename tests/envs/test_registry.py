@@ -1,5 +1,6 @@
 """make_env and make_task: names, seeds, goals, several processes, and what is said when a simulator is missing."""
 
+import re
 import subprocess
 import sys
 from contextlib import closing
@@ -12,7 +13,16 @@ from tensordict import TensorDict
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_ocwm.envs import ENVIRONMENTS, Reacher, Task, make_env, make_task, registry
+from torchrl_ocwm.envs import (
+    ENVIRONMENTS,
+    Reacher,
+    Task,
+    find_environment,
+    make_env,
+    make_task,
+    register_environment,
+    registry,
+)
 
 
 @pytest.fixture(scope="module")
@@ -206,6 +216,49 @@ def test_missing_simulator_says_what_to_install(monkeypatch, make, missing):
         ModuleNotFoundError, match=rf"'reacher' needs {missing}.*pip install 'torchrl-ocwm\[dm-control\]"
     ):
         make("reacher")
+
+
+class Other:
+    """Not an environment, but a class."""
+
+
+@pytest.mark.usefixtures("registries")
+def test_registering():
+    made = register_environment("push_far", "somewhere:Else", modules=("not_there",))
+    assert (made.id, find_environment("ocwm/PushFar-v0"), ENVIRONMENTS["push_far"]) == ("ocwm/PushFar-v0", made, made)
+    assert gymnasium.spec("ocwm/PushFar-v0").entry_point == "somewhere:Else"
+    assert register_environment("push_far", "somewhere:Else").modules == ()
+    with pytest.raises(ModuleNotFoundError, match="No module named 'somewhere'"):
+        make_env("push_far")
+    register_environment("other", Other)
+    assert gymnasium.spec("ocwm/Other-v0").entry_point is Other
+    anew = type("Other", (), {"__module__": __name__})  # a cell of a notebook that is run again
+    register_environment("other", anew)
+    assert gymnasium.spec("ocwm/Other-v0").entry_point is anew
+
+
+@pytest.mark.usefixtures("registries")
+def test_what_a_registered_environment_needs():
+    register_environment("far", "somewhere:Else", modules=("not_there",))
+    with pytest.raises(
+        ModuleNotFoundError, match="'far' needs not_there, which is not installed: pip install not_there"
+    ):
+        make_task("far")
+
+
+@pytest.mark.parametrize(
+    ("name", "entry_point", "message"),
+    [
+        ("Reacher", "a:B", "a name like 'cube_move', got 'Reacher'"),
+        ("reacher2 ", "a:B", "a name like 'cube_move'"),
+        ("far", "a.B", "must be a class or 'module:Class', got 'a.B'"),
+        ("far", "os.system('a'):B", "must be a class or 'module:Class'"),
+        ("reacher", "a:B", "'reacher' is registered already, as torchrl_ocwm.envs.reacher:Reacher"),
+    ],
+)
+def test_what_cannot_be_registered(name, entry_point, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        register_environment(name, entry_point)
 
 
 def test_number_of_environments():

@@ -272,6 +272,18 @@ def test_landmarks(task: Task) -> None:
         LandmarkEvaluation(agent, episodes=11, episode_steps=3)
 
 
+def test_landmarks_are_given_as_images_to_agents_that_take_nothing_else(task: Task) -> None:
+    agent, seen = build_agent("lexa_temporal", task, size="debug"), []
+    with LandmarkEvaluation(agent, episodes=2, episode_steps=2) as evaluation:
+        evaluation.policy.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]["goal", "pixels"]))
+        scores = evaluation(0)
+        expected = goal_images(task, evaluation.goals)
+    assert set(scores) >= {"evaluation/final_score"}
+    assert len(seen) == 2
+    for images in seen:
+        assert torch.equal(images, expected)
+
+
 def test_the_test_task_is_reachers(task: Task) -> None:
     """What tests and doctests use without a simulator has the simulator's shapes."""
     workspace = replace(task.workspace, landmarks=reacher_task().workspace.landmarks, reach=(0.042, 0.24))

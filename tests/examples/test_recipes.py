@@ -89,6 +89,19 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     assert torchrl_ocwm.load_agent(pcp).agent.config.behaviours["reach"].goal == Position()
 
 
+def test_agents_that_take_images_only(dataset: Path, tmp_path: Path) -> None:
+    """Evaluated with images, in training and afterwards, without being asked to."""
+    checkpoint, output = train(dataset, tmp_path / "lexa", "agent=lexa_temporal"), tmp_path / "evaluation"
+    assert (tmp_path / "lexa" / "log" / "scalars" / "evaluation" / "final_score.csv").stat().st_size > 10
+    small = ("goals=4", "episode_steps=3", "workers=0", "envs=4", "random=false", "video_goals=2")
+    run("evaluate.py", f"checkpoint={checkpoint}", *small, f"output={output}")
+    results = json.loads((output / "results.json").read_text())
+    assert list(results["agents"]) == ["lexa_temporal, image goals"]
+    assert len(results["agents"]["lexa_temporal, image goals"]["per_goal"][0]["final_score"]) == 4
+    assert (output / "episodes_image_goals.mp4").stat().st_size > 1000
+    assert not (output / "episodes.mp4").exists()
+
+
 @pytest.mark.parametrize(
     ("script", "arguments", "message"),
     [

@@ -67,3 +67,12 @@ def test_gradients_go_through_values_alone() -> None:
 def test_an_unknown_mode() -> None:
     with pytest.raises(ValueError, match="mode must be one of 'none', 'scale', 'standard', got 'rms'"):
         StreamingNorm("rms")
+
+
+def test_compiled_it_is_the_same() -> None:
+    """In one graph, as the update is compiled, its state included."""
+    plain, other = StreamingNorm("standard"), StreamingNorm("standard")
+    compiled = torch.compile(other, backend="eager", fullgraph=True)
+    for batch in BATCHES[:3]:
+        torch.testing.assert_close(compiled(batch), plain(batch))
+    torch.testing.assert_close(other.state_dict(), plain.state_dict())

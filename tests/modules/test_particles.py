@@ -97,3 +97,14 @@ def test_reward(flat: bool) -> None:
     reward: Any = EntropyReward(k=2, latent_key=("a", "b"), flat=flat, reward_key="bonus")
     got = reward(TensorDict({"a": {"b": latents}}, [6]))["bonus"]
     torch.testing.assert_close(got.squeeze(-1), all_pairs(latents.reshape(6, 2), 2), rtol=1e-4, atol=1e-4)
+
+
+def test_compiled_it_is_the_same() -> None:
+    """In one graph, as the update is compiled."""
+    compiled = torch.compile(particle_entropy, backend="eager", fullgraph=True)
+    particles = torch.randn(30, 4, requires_grad=True)
+    grads = [
+        torch.autograd.grad(one(particles, k=3, chunk=20).square().sum(), particles)[0]
+        for one in (particle_entropy, compiled)
+    ]
+    torch.testing.assert_close(grads[0], grads[1])

@@ -18,7 +18,10 @@ from torchrl_ocwm import build_agent, load_agent, make_env, make_task
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, Behaviour, save_agent
 from torchrl_ocwm.agents.checkpoint import describe, read_parts
 from torchrl_ocwm.data import EpisodeDataset
+from torchrl_ocwm.data.collect import collect
+from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import EnvChoice, find_environment
+from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.evaluation import EvaluationEnvs
 from torchrl_ocwm.parts import VARIABLE, load_plugins
 from torchrl_ocwm.settings import SettingsError, change, to_dict
@@ -78,8 +81,7 @@ def example(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_row_by_its_name() -> None:
-    """The first use of an unknown name loads the package."""
-    assert "nearness" not in AGENTS
+    """An unknown name loads the package."""
     agent = build_agent("nearness", reacher_task(), "debug")
     assert agent.loss(random_records(reacher_task(), 2, 3))["loss_actor"].isfinite()
 
@@ -125,6 +127,13 @@ def test_a_fresh_process_loads_an_agent_of_such_parts(tmp_path: Path) -> None:
     for part in ("world_model 'wide'", "reward 'nearness'", "goal_source 'remembered'", "optimizer 'sgd'"):
         assert f"{part} of the package 'ocwm_example'" in line
     assert line.endswith(f"install what registers them, or name it in {VARIABLE}")
+
+
+def test_a_package_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, "ocwm_example, ocwm_exmple")
+    load_plugins.cache_clear()
+    with pytest.raises(MissingPackageError, match=f"{VARIABLE} names 'ocwm_exmple', which is not installed and not on"):
+        build_agent("no_such_row", reacher_task(), "debug")
 
 
 def test_nothing_in_a_description_names_code() -> None:
@@ -192,3 +201,7 @@ def test_from_collected_data_to_a_table(tmp_path: Path) -> None:
     away = (episodes["object_position_true"][:, -1, 1] - goals).norm(dim=-1)
     scored = torch.tensor(results["agents"][name]["per_goal"][0]["final_distance"])
     torch.testing.assert_close(scored, away, atol=1e-4, rtol=0)
+    # The agent collects in a process of its own.
+    more = Collection(steps=75, policy=str(run / "checkpoint.zip"), workers=1)
+    with collect(data, "dots", more, options=EpisodeDataset.open(data).metadata["options"], progress=False) as dataset:
+        assert list(dataset.metadata["policies"].values()) == [4, 1]

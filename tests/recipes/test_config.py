@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, fields
+from itertools import cycle
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from torchrl_ocwm.agents import AGENTS, SIZES, Adam, LatentSimilarity, ObjectCentric
+from torchrl_ocwm.agents import AGENTS, SIZES, Adam, LatentSimilarity, ObjectCentric, StateEntropy
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.recipes import keep_settings
 from torchrl_ocwm.settings import Settings, change, field_docs, to_dict
@@ -59,7 +60,7 @@ collect timeout=nan                                timeout must be a number, got
 collect timeout=soon                               timeout must be a number, got 'soon'
 collect workers=-1                                 workers must be at least 0, got -1
 collect workers=abc                                workers must be a whole number, got 'abc'
-collect +foo=1                                     foo is no setting; there are steps, policy, workers, seed,
+collect +foo=1                                     foo is no setting; there are steps, policy,
 diagnose checkpoint=[a,b]                          checkpoint must be a text, got ['a', 'b']
 diagnose checkpoint=null                           checkpoint must be a text, got None
 diagnose context=50                                context=50 of length=50 frames
@@ -177,7 +178,7 @@ class TestGroups:
     """Rows by name, and changes to them."""
 
     def test_all_rows(self, compose: Callable[..., Any]) -> None:
-        for agent, size in zip([*AGENTS], [*SIZES], strict=True):
+        for agent, size in zip([*AGENTS], cycle(SIZES), strict=False):
             settings = compose("train_offline", f"agent={agent}", f"size={size}")
             assert (settings.agent, settings.size) == (AGENTS[agent], SIZES[size])
         for env, row in ENVIRONMENTS.items():
@@ -222,6 +223,12 @@ class TestGroups:
         assert (reach.reward, reach.goal.weight) == (LatentSimilarity("cosine"), 100.0)
         said = compose("train_offline", "agent.world_model={name:object,lambda_proprio:5}").agent.world_model
         assert said == ObjectCentric(lambda_proprio=5.0)
+
+    def test_parts_of_an_explorer(self, compose: Callable[..., Any]) -> None:
+        changed = "agent.behaviours.explore.reward={name:state_entropy,k:3}"
+        settings = compose("train_offline", "agent=dreamer_pcp", "explore=plan2explore", changed)
+        assert settings.agent.behaviours["explore"].reward == StateEntropy(k=3)
+        assert settings.agent.behaviours["reach"] == AGENTS["dreamer_pcp"].behaviours["reach"]
 
     def test_options_of_environments(self, compose: Callable[..., Any]) -> None:
         settings = compose("collect", "env=cube_move", "env.options.objects=[cube,distractor]")

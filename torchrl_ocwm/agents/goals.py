@@ -121,7 +121,7 @@ class ObjectLatent(Goal):
 @register("full_latent")
 @dataclass(frozen=True)
 class FullLatent(Goal):
-    """They also see the latent of the whole scene, state and belief, that an image of the goal gives (LEXA cosine).
+    """Actor and critic also see the latent of the scene, state and belief, that a goal image gives (LEXA cosine).
 
     In training a frame is encoded as a goal image is when the agent acts: alone, as the first frame of an episode. The
     latent that the world model has of the frame remembers what came before it, which no goal image does.
@@ -148,7 +148,7 @@ class FullLatent(Goal):
 @register("image_embedding")
 @dataclass(frozen=True)
 class ImageEmbedding(Goal):
-    """They also see what the world model's encoder makes of an image of the goal (LEXA temporal)."""
+    """Actor and critic also see what the world model's encoder makes of a goal image (LEXA temporal)."""
 
     def build(self, scene: Scene) -> GoalEncoding:
         """The image's part of the embedding; of several images, that of the last."""

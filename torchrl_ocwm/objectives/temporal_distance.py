@@ -12,6 +12,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
+from torchrl_ocwm.settings import SettingsError
+
 
 class TemporalPairs(NamedTuple):
     """Pairs of points of imagined rollouts, and how far apart they are.
@@ -55,7 +57,7 @@ def temporal_pairs(
         The pairs, positives first.
 
     Raises:
-        ValueError: if there are to be negatives, and there is one sequence only.
+        SettingsError: if there are to be negatives, and there is one sequence only.
 
     Examples:
         >>> pairs = temporal_pairs(2, 3, 10, positives=4, negatives=1)
@@ -63,7 +65,7 @@ def temporal_pairs(
         (torch.Size([5, 2]), tensor(1.))
     """
     if negatives and sequences < 2:
-        raise ValueError(
+        raise SettingsError(
             "a batch of one sequence has no other sequences, which negatives come from; use learning.batch_size of at "
             "least 2, or negatives=0"
         )
@@ -178,7 +180,7 @@ class TemporalDistanceLoss(LossModule):
         return TensorDict(
             {
                 "loss_embedding": self._embedding_error(records["next"].detach()),
-                "loss_temporal_distance": self._distance_error(imagined.detach(), *records.batch_size),
+                "loss_temporal_distance": self._distance_error(imagined, *records.batch_size),
             }
         )
 

@@ -155,10 +155,10 @@ def _given(config: DictConfig) -> dict[str, Any]:
         raise SettingsError(f"{lacking[0]} is missing; give it, as in {lacking[0]}=...")
     values: Any = OmegaConf.to_container(config, resolve=True)
     choices = HydraConfig.get().runtime.choices
-    for group, rows in (("agent", AGENTS), ("size", SIZES)):
-        if group in values and choices.get(group) in rows:
-            values[group] = _without_leftovers(values[group], to_dict(rows[choices[group]]))
-    return values
+    rows = {group: to_dict(known.get(choices.get(group))) for group, known in (("agent", AGENTS), ("size", SIZES))}
+    if rows["agent"] and choices.get("explore") in EXPLORERS:
+        rows["agent"]["behaviours"][EXPLORE] = to_dict(EXPLORERS[choices["explore"]])
+    return {name: _without_leftovers(value, rows.get(name)) for name, value in values.items()}
 
 
 def _without_leftovers(values: Any, row: Any) -> Any:
@@ -167,8 +167,8 @@ def _without_leftovers(values: Any, row: Any) -> Any:
         return values
     if values.get("name") == row.get("name"):
         return {name: _without_leftovers(value, row.get(name)) for name, value in values.items()}
-    parts = [kind[values["name"]] for kind in Part.registered.values() if values["name"] in kind]
-    known = {one.name for part in parts for one in fields(part)}
+    named: list[Any] = [kind.get(str(values.get("name"))) for kind in Part.registered.values()]
+    known = {one.name for part in named if part is not None for one in fields(part)}
     return {name: value for name, value in values.items() if name in known or row.get(name) != value}
 
 

@@ -21,6 +21,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.data.seeds import episode_seed
+from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.modules.acting import LATENT
 from torchrl_ocwm.processes import end_with_parent, interrupts_ignored
 from torchrl_ocwm.training.settings import Online
@@ -91,7 +92,7 @@ def make_collector(
         chunk: Steps after which a worker reports.
 
     Raises:
-        ModuleNotFoundError: if Ray is asked for and missing, with the extra to install.
+        MissingPackageError: if Ray is asked for and missing, with the extra to install.
     """
     every = max(online.workers, 1)
     envs = [partial(_numbered, make, policy.seed, first + worker, every) for worker in range(every)]
@@ -201,7 +202,7 @@ def _ray_collector(
     envs: Sequence[Callable[[], EnvBase]], policy: Turns, chunk: int, whole: dict[str, Any]
 ) -> BaseCollector:
     if find_spec("ray") is None:
-        raise ModuleNotFoundError("collector=ray needs Ray: pip install 'torchrl-ocwm[ray]'", name="ray")
+        raise MissingPackageError("collector=ray needs Ray: pip install 'torchrl-ocwm[ray]'", name="ray")
     from torchrl.collectors.distributed.ray import DEFAULT_RAY_INIT_CONFIG, RayCollector
 
     return RayCollector(

@@ -100,8 +100,8 @@ def train_online(
         The checkpoint.
 
     Raises:
-        RuntimeError: if one episode after the other fails.
-        ModuleNotFoundError: if Ray is asked for and missing.
+        CollectionError: if one episode after the other fails.
+        MissingPackageError: if Ray is asked for and missing.
         Exception: what :func:`~torchrl_ocwm.training.offline.train_offline` raises.
     """
     folder = Path(folder)
@@ -192,7 +192,7 @@ class Player:
         """Play at least ``round_episodes`` episodes.
 
         Raises:
-            RuntimeError: if one episode after the other fails.
+            CollectionError: if one episode after the other fails.
         """
         self._acting.load_state_dict(self._learning.state_dict())
         self._sent = False

@@ -31,7 +31,7 @@ def measure(side: str, weight: int, seed: int, arguments: argparse.Namespace) ->
     output = Path(arguments.output) / f"{side}_{weight}" / f"seed_{seed}"
     updates, dataset = f"training.updates={arguments.updates}", f"dataset={arguments.dataset}"
     settings = ["agent=focus_lcp", "env=reacher", "size=cpu", "training.threads=1", "training.video_interval=0"]
-    settings += [f"{GOAL}.gradient={side}", f"{GOAL}.weight={weight}"]
+    settings += [f"{GOAL}.gradient={side}", f"{GOAL}.weight={weight}", f"training.eval_interval={arguments.updates}"]
     run("train_offline", *settings, updates, dataset, f"training.seed={seed}", f"output={output}")
     looked_at = [f"checkpoint={output}/checkpoint.zip", dataset, "video_sequences=0", f"output={output}/diagnosis"]
     run("diagnose", *looked_at)
