@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -505,8 +505,3 @@ def test_the_documented_command(tmp_path: Path) -> None:
     dataset = EpisodeDataset.open(tmp_path / "data", verify=True)
     assert dataset.metadata["policies"] == {"scripted": 1, "random": 1, "reach": 2}
     assert updates(tmp_path) == 4
-
-
-def test_every_setting_is_documented() -> None:
-    page = (ROOT / "docs" / "howto.md").read_text()
-    assert [one.name for one in fields(Online) if f"`online.{one.name}`" not in page] == []
