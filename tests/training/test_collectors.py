@@ -181,3 +181,32 @@ def test_what_is_in_time_is_left_alone() -> None:
     assert numbers(episodes) == [2, 7]
     assert [len(episode) for episode in episodes] == [1, 2]
     assert not killed.wait(0.6)
+
+
+class Deaf:
+    """A collector whose processes do not answer, or cannot be told."""
+
+    def __init__(self, alive: bool, error: Exception | None = None) -> None:
+        self.procs = [SimpleNamespace(is_alive=lambda: alive)]
+        self.error = error
+        self.released = threading.Event()
+
+    def update_policy_weights_(self) -> None:
+        if self.error is not None:
+            raise self.error
+        self.released.wait(60)
+
+
+@pytest.mark.parametrize(
+    ("collector", "timeout", "message"),
+    [
+        (Deaf(alive=False), 600, "a process that plays has ended"),
+        (Deaf(alive=True), 0.2, "does not take new weights"),
+        (Deaf(alive=True, error=ValueError("odd")), 600, "new weights have not reached .*odd"),
+    ],
+    ids=["ended", "hangs", "error"],
+)
+def test_weights_that_do_not_arrive(collector: Any, timeout: float, message: str) -> None:
+    with pytest.raises(RuntimeError, match=message):
+        collectors.send_weights(collector, timeout)
+    collector.released.set()

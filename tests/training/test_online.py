@@ -6,12 +6,13 @@ import csv
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -46,10 +47,22 @@ def fresh(name: str = "dreamer_pcp") -> Agent:
     return build_agent(name, make_task("reacher", image_size=16), "debug")
 
 
+SEEDS: dict[str, Path] = {}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _seed_steps(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Collected once, as long as a test has no others."""
+    SEEDS["data"] = tmp_path_factory.mktemp("seeds") / "data"
+    collect_seed_steps(SEEDS["data"], "reacher", ONLINE, options=OPTIONS, progress=False).close()
+
+
 def run(
     folder: Path, agent: Agent | None = None, training: Training = TRAINING, online: Online = ONLINE, **kwargs: Any
 ) -> EpisodeDataset:
     agent = fresh() if agent is None else agent
+    if online.seed_policy == ONLINE.seed_policy and not (folder / "data").exists():
+        shutil.copytree(SEEDS["data"], folder / "data")
     with collect_seed_steps(folder / "data", "reacher", online, options=OPTIONS, progress=False) as dataset:
         train_online(agent, dataset, folder, training, online, progress=False, **kwargs)
     return dataset
@@ -199,6 +212,14 @@ class TestRun:
         assert torch.equal(*(data.records["next", "pixels"][seeds : seeds + 1] for data in (one, other)))
         assert not torch.equal(*(data.records["action"][seeds + 1 : seeds + 2] for data in (one, other)))
 
+    def test_the_seed_of_training_is_that_of_the_episodes(self, tmp_path: Path) -> None:
+        goals = []
+        for seed in (0, 1):
+            training = replace(TRAINING, updates=3, seed=seed)
+            records = run(tmp_path / str(seed), training=training).records["next"]
+            goals.append(records["goal_position"][2 * (HORIZON + 1) :: HORIZON + 1])
+        assert not torch.isclose(*goals).all(-1).any()
+
     def test_a_signal_breaks_a_round_off(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """The episodes that were whole are kept, the update before is saved."""
         played: list[int] = []
@@ -263,7 +284,8 @@ def updates(folder: Path) -> int:
 class TestPlayer:
     @pytest.fixture
     def player(self, tmp_path: Path) -> Iterator[Player]:
-        with collect_seed_steps(tmp_path / "data", "reacher", ONLINE, options=OPTIONS, progress=False) as dataset:
+        shutil.copytree(SEEDS["data"], tmp_path / "data")
+        with EpisodeDataset.open(tmp_path / "data", write=True) as dataset:
             player = Player(fresh(), dataset, ONLINE, seed=0)
             player.stop = SimpleNamespace(stopped=False, look=lambda function: function())
             yield player
@@ -290,6 +312,18 @@ class TestPlayer:
         player.play_round()
         assert player.dataset.metadata["failures"] == 1
         assert player.dataset.metadata["next_online_episode"] == 5
+
+    @pytest.mark.slow
+    def test_a_process_that_was_killed_is_replaced(self, player: Player) -> None:
+        player.online = replace(ONLINE, workers=1, round_episodes=1)
+        player.play_round()
+        assert player._collector is not None
+        (process,) = player._collector.procs
+        os.kill(process.pid, signal.SIGKILL)
+        with pytest.warns(RuntimeWarning, match="a process that plays has ended"):
+            player.play_round()
+        assert len(player.dataset) == 4
+        assert player.dataset.metadata["failures"] == 1
 
     def test_failures_in_a_row_end_it(self, player: Player, monkeypatch: pytest.MonkeyPatch) -> None:
         self.fail_at(monkeypatch, *range(10))
@@ -471,8 +505,3 @@ def test_the_documented_command(tmp_path: Path) -> None:
     dataset = EpisodeDataset.open(tmp_path / "data", verify=True)
     assert dataset.metadata["policies"] == {"scripted": 1, "random": 1, "reach": 2}
     assert updates(tmp_path) == 4
-
-
-def test_every_setting_is_documented() -> None:
-    page = (ROOT / "docs" / "howto.md").read_text()
-    assert [one.name for one in fields(Online) if f"`online.{one.name}`" not in page] == []
