@@ -290,6 +290,18 @@ def test_failed_episode_is_left_out(tmp_path, monkeypatch):
         assert (episode == whole[number]).all()  # the others are as they would have been
 
 
+def test_numbers_of_episodes_that_failed_are_not_used_again(tmp_path, monkeypatch):
+    """Also by a collection that goes on."""
+    whole = episodes(gather(tmp_path / "whole", 80))
+    monkeypatch.setattr(collect_module, "EpisodePlayer", BreaksAt)
+    monkeypatch.setattr(BreaksAt, "numbers", (1,))
+    with pytest.warns(RuntimeWarning, match="is left out"):
+        gather(tmp_path / "data", 40)
+    dataset = gather(tmp_path / "data", 60)
+    for episode, number in zip(episodes(dataset), (0, 2, 3), strict=True):
+        assert (episode == whole[number]).all()
+
+
 def test_simulator_that_fails_again_and_again(tmp_path, monkeypatch):
     monkeypatch.setattr(collect_module, "EpisodePlayer", BreaksAt)
     monkeypatch.setattr(BreaksAt, "numbers", range(100))

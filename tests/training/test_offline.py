@@ -504,6 +504,13 @@ class TestBadInput:
             train(fresh(), dataset, tmp_path)
         assert file.read_bytes() == before
 
+    def test_checkpoint_of_another_size(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        """Also of one that has the same shapes, and learns in another way."""
+        train(fresh(), dataset, tmp_path, replace(SHORT, updates=2))
+        size = change(SIZES["debug"], {"learning.gamma": 0.5})
+        with pytest.raises(CheckpointError, match=r"size\.learning\.gamma: 0\.99 there, 0\.5 here"):
+            train(build_agent("dreamer_pcp", reacher_task(), size), dataset, tmp_path)
+
     def test_dataset_of_another_task(self, tmp_path: Path) -> None:
         other = random_dataset(tmp_path / "data", reacher_task(32))
         with pytest.raises(DatasetError, match="but the agent was built for"):
