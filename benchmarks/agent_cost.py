@@ -21,7 +21,7 @@ clock is read at every cut. The parts, each forward and backward:
     RSSM         the rollout over the sequences, prior and posterior
     decoders     all that the world model predicts from the latents: images, vectors, objects, reward, continuation,
                  and the latents that goals are made of
-    imagination  goals, imagined trajectories, losses of actor and critic
+    imagination  goals, imagined trajectories, losses of actor, critic and of what rewards learn, for each behaviour
     optimiser    zeroed gradients, the optimiser's step, the slow critic
     other        the rest: the selection of records and the losses of the predictions, KL included
 

@@ -151,11 +151,11 @@ def test_classes_without_their_packages_name_them(module: str) -> None:
 
 
 def test_check_goes_on_without_a_simulator(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    missing = ENVIRONMENTS["cube_move"]._replace(module="no_such_simulator")
+    missing = ENVIRONMENTS["cube_move"]._replace(modules=("no_such_simulator",))
     monkeypatch.setitem(ENVIRONMENTS, "cube_move", missing)
     assert check.main() == 0
     assert (
-        "cube_move needs no_such_simulator, which is not installed: pip install 'torchrl-ocwm[robosuite]'"
+        "environment 'cube_move' needs no_such_simulator, which is not installed: pip install 'torchrl-ocwm[robosuite]'"
         in capsys.readouterr().out
     )
 
