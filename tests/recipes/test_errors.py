@@ -85,7 +85,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         ("collect", "policy=rnd", "SettingsError: policy must be random, scripted or a checkpoint file, got 'rnd'"),
         ("collect", "policy={other} dataset=d", "SettingsError: policy={other}: the agent was trained for 'reacher'"),
         ("collect", "dataset={data}", "DatasetError: {data}: holds a dataset of 'reacher' with options {{}}, not of"),
-        ("collect", "dataset={results}", "DatasetError: {results}: cannot"),
+        ("collect", "dataset={results} env.options.horizon=2", "DatasetError: {results}: cannot"),
         ("train_offline", "dataset=/nowhere", "DatasetError: /nowhere/dataset.json: no such file"),
         ("train_offline", "dataset={data} env=cube_move", "DatasetError: {data}: holds reacher, not env=cube_move"),
         ("train_offline", "dataset={data} training.device=cuda:99", "DeviceError: device 'cuda:99' cannot be used ("),
@@ -135,7 +135,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         ("evaluate", "checkpoint={results}", "CheckpointError: {results}: not a checkpoint of TorchRL, or damaged"),
         ("evaluate", "checkpoint={agent} include=[{results}]", "ReportError: {results}: not the results.json of"),
         ("evaluate", "checkpoint=[{agent},{agent}]", "SettingsError: {agent}: the same run as {agent}, which counts"),
-        ("evaluate", "checkpoint=[{agent},{other}]", "SettingsError: {other} is of Task(name='reacher', image_size=32"),
+        ("evaluate", "checkpoint=[{agent},{other}]", "SettingsError: {other} is about the 'finger' of Task(name="),
         ("diagnose", "checkpoint={agent} dataset={small}", "DatasetError: {small}: holds Task(name='reacher', image_"),
         ("diagnose", "checkpoint={agent} dataset={data} device=tpu", "DeviceError: device 'tpu' cannot be used"),
         ("diagnose", "checkpoint={agent} dataset={data}", "DatasetError: {data}: cannot cut sequences of 50 frames"),
@@ -175,9 +175,8 @@ def test_a_package_is_missing(command: Callable[..., str], monkeypatch: pytest.M
 def test_a_plugin_is_missing(command: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHRL_OCWM_PLUGINS", "no_such_package.parts")
     load_plugins.cache_clear()
-    assert (
-        command("collect") == "MissingPackageError: TORCHRL_OCWM_PLUGINS=no_such_package.parts: there is no such module"
-    )
+    message = "MissingPackageError: TORCHRL_OCWM_PLUGINS names 'no_such_package.parts', which is not installed"
+    assert command("collect").startswith(message)
 
 
 def test_a_plugin_lacks_something_itself(

@@ -253,7 +253,7 @@ def episodes(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         def __init__(self, task: Any, **settings: Any) -> None:
             self.settings = {"task": task, **settings}
 
-        def run(self, policy: Any, goals: torch.Tensor) -> TensorDict:
+        def run(self, policy: Any, goals: torch.Tensor, **images: Any) -> TensorDict:
             seen.append({**self.settings, "goals": goals, "agent": policy.agent})
             place = torch.zeros(len(goals), 2, 1, 2)
             return TensorDict({"object_position_true": place, "goal_position": torch.zeros(len(goals), 2, 2)})
@@ -280,7 +280,8 @@ def train(command: Callable[..., str], tmp_path: Path, dataset: EpisodeDataset) 
 
 @shows("Training.eval_episodes", "Training.eval_steps", "Workspace.landmarks")
 def test_evaluations_while_training(train: Callable[..., str], episodes: list[dict[str, Any]]) -> None:
-    train("training.eval_interval=1", "training.eval_episodes=3", "training.eval_steps=7", "output=run")
+    settings = ("training.eval_interval=1", "training.eval_episodes=3", "training.eval_steps=7")
+    assert "checkpoint: run/checkpoint.zip" in train(*settings, "output=run")
     assert len(episodes) == 2
     assert episodes[0]["episode_steps"] == 7
     torch.testing.assert_close(episodes[0]["goals"], torch.tensor(POINTS[:3]))
