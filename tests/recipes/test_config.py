@@ -261,7 +261,7 @@ class TestHydra:
         assert "lambda_proprio: 1.0" in command("train_offline", "--info", "config")
 
     def test_says_what_each_setting_is(self) -> None:
-        """In a process of its own: other tests fill Hydra's store with hundreds of options, all of which it would read."""
+        """In a process of its own: other tests fill Hydra's store with hundreds of options, which it would read."""
         script = str(EXAMPLES / "train_offline.py")
         done = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True, check=True)
         lines = done.stdout.splitlines()
