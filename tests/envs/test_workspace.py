@@ -57,7 +57,7 @@ def test_check_names_what_is_wrong(goal, message):
 
 @pytest.mark.parametrize(("low", "high"), [((0.0,), (0.0,)), ((0.0, 1.0), (1.0, 0.5)), ((0.0,), (1.0, 1.0))])
 def test_corners_in_the_wrong_order(low, high):
-    with pytest.raises(ValueError, match="low < high on every axis"):
+    with pytest.raises(ValueError, match="low must be below high on every axis"):
         Workspace(low=low, high=high)
 
 

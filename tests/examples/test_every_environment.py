@@ -70,11 +70,13 @@ def test_from_dataset_to_film(collected: tuple[str, Path], agent: str, tmp_path:
     small = ("goals=4", "episode_steps=3", "workers=0", "envs=1", "video_goals=1", "image_goals=true")
     run("evaluate.py", f"checkpoint={output}/checkpoint.zip", f"output={evaluation}", *small)
     rows = json.loads((evaluation / "results.json").read_text())["agents"]
-    assert list(rows) == ["random", agent, *([f"{agent}, image goals"] if policy.takes_images else [])]
+    goals = {agent: policy.takes_positions, f"{agent}, image goals": policy.takes_images}
+    assert list(rows) == ["random", *(row for row, taken in goals.items() if taken)]
     for row in rows.values():
         [of_goals] = row["per_goal"]
         assert len(of_goals["final_score"]) == 4
         assert all(0 < score <= 1 for score in of_goals["final_score"])
     objects = ("objects.png", "objects.mp4", "errors.png") if agent.startswith("focus") else ()
-    for picture in ("heatmap.png", "learning_curve.png", "episodes.mp4", *objects):
+    film = "episodes.mp4" if policy.takes_positions else "episodes_image_goals.mp4"
+    for picture in ("heatmap.png", "learning_curve.png", film, *objects):
         assert (evaluation / picture).stat().st_size > 1000
