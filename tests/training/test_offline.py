@@ -511,6 +511,14 @@ class TestBadInput:
         with pytest.raises(CheckpointError, match=r"size\.learning\.gamma: 0\.99 there, 0\.5 here"):
             train(build_agent("dreamer_pcp", reacher_task(), size), dataset, tmp_path)
 
+    def test_images_that_show_the_goal_contradict_imagined_ones(self, tmp_path: Path) -> None:
+        task = replace(reacher_task(), options={"virtual_target": 5})
+        shown = random_dataset(tmp_path / "data", task)
+        torch.manual_seed(0)
+        with pytest.raises(DatasetError, match=r"the images show the goal .* the behaviour 'reach' is given others"):
+            train(build_agent("dreamer_pcp", task, "debug"), shown, tmp_path / "pcp")
+        assert train(build_agent("dreamer", task, "debug"), shown, tmp_path / "dreamer").exists()
+
     def test_dataset_of_another_task(self, tmp_path: Path) -> None:
         other = random_dataset(tmp_path / "data", reacher_task(32))
         with pytest.raises(DatasetError, match="but the agent was built for"):
