@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from torchrl_ocwm.agents import collecting_policy
 from torchrl_ocwm.data.collect import collect
 from torchrl_ocwm.data.settings import Collection
-from torchrl_ocwm.envs import EnvChoice, make_task
+from torchrl_ocwm.envs import EnvChoice
 from torchrl_ocwm.recipes import recipe
 from torchrl_ocwm.signals import ended_by_signals
 
@@ -35,7 +35,7 @@ class Collect(Collection):
 @ended_by_signals()
 def main(config: Collect) -> None:
     options = dict(config.env.options)
-    policy = collecting_policy(config, make_task(config.env.name, **options))
+    policy = collecting_policy(config, config.env.name, options)
     dataset = collect(config.dataset, config.env.name, config, policy=policy, options=options)
     index = dataset.metadata
     policies = ", ".join(f"{number} {policy}" for policy, number in index.get("policies", {}).items())

@@ -19,6 +19,7 @@ from tensordict import TensorDict
 from torchrl_ocwm.agents import AGENTS, EXPLORERS, SIZES, Agent, build_agent
 from torchrl_ocwm.envs import ENVIRONMENTS
 from torchrl_ocwm.parts import Part
+from torchrl_ocwm.recipes import config as recipes
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records, reacher_task
 
@@ -133,5 +134,28 @@ def command(
             said = printed.err if stop.code else printed.out
             return stop.code if isinstance(stop.code, str) else said
         return capsys.readouterr().out
+
+    return run
+
+
+class Composed(BaseException):
+    """The settings of a command; nothing else is done."""
+
+
+@pytest.fixture
+def compose(command: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """The settings that a script would run with, or what it says of a value that it refuses."""
+    read = recipes.from_dict
+
+    def stop(*arguments: Any) -> Any:
+        raise Composed(read(*arguments))
+
+    monkeypatch.setattr(recipes, "from_dict", stop)
+
+    def run(script: str, *arguments: str) -> Any:
+        try:
+            return command(script, *arguments)
+        except Composed as composed:
+            return composed.args[0]
 
     return run

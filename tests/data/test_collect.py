@@ -32,7 +32,7 @@ def gather(path, steps, *, options=OPTIONS, policy="random", **settings):
     module = policy if isinstance(policy, TensorDictModuleBase) else None
     names = {} if module is not None else {"policy": str(policy)}
     settings = Collection(**{"steps": steps, "workers": 0, **names, **settings})
-    module = module or collecting_policy(settings, make_task("reacher", **options))
+    module = module or collecting_policy(settings, "reacher", options)
     return collect(path, "reacher", settings, policy=module, options=options, progress=False)
 
 
@@ -399,7 +399,7 @@ def test_which_behaviour_collects(tmp_path):
     row = AGENTS["dreamer_pcp"].and_behaviours(explore=EXPLORERS["plan2explore"])
     file = save_agent(build_agent(row, task, "debug"), tmp_path / "agent.zip")
     for behaviour in ("explore", None):
-        policy = collecting_policy(Collection(policy=str(file), behaviour=behaviour), task)
+        policy = collecting_policy(Collection(policy=str(file), behaviour=behaviour), "reacher", OPTIONS)
         assert policy.behaviour is policy.agent.behaviours[behaviour or "reach"]
     found = gather(tmp_path / "data", 20, policy=file, behaviour="explore")
     assert found.metadata["policies"] == {f"{file} (explore)": 1}

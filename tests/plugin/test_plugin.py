@@ -204,6 +204,6 @@ def test_from_collected_data_to_a_table(tmp_path: Path) -> None:
     # The agent collects in a process of its own.
     more = Collection(steps=75, policy=str(run / "checkpoint.zip"), workers=1)
     options = EpisodeDataset.open(data).metadata["options"]
-    acts = collecting_policy(more, policy.agent.task)
+    acts = collecting_policy(more, "dots", options)
     with collect(data, "dots", more, policy=acts, options=options, progress=False) as dataset:
         assert list(dataset.metadata["policies"].values()) == [4, 1]

@@ -67,6 +67,9 @@ def test_a_signal_ends_it_with_a_checkpoint_and_without_children(
         finally:
             process.kill()
     assert out.startswith("checkpoint: ")
+    end = time.monotonic() + 10
+    while children(process.pid) and time.monotonic() < end:  # they end when they see that it has
+        time.sleep(0.1)
     assert children(process.pid) == set()
     read_manifest(tmp_path / "checkpoint.zip")
     assert list((tmp_path / "log" / "scalars").rglob("*.csv")) == []

@@ -168,7 +168,7 @@ def test_the_recipe_collects_what_it_is_told(
 ) -> None:
     seen = SimpleNamespace()
 
-    def stub(path: str, environment: str, settings: Collection, *, options: dict[str, Any]) -> Any:
+    def stub(path: str, environment: str, settings: Collection, *, policy: None, options: dict[str, Any]) -> Any:
         seen.__dict__.update(path=path, environment=environment, settings=settings, options=options)
         return SimpleNamespace(path=path, num_steps=3, episode_lengths=[4], metadata={"coverage": {}})
 

@@ -132,7 +132,7 @@ def test_a_behaviour_collects(tmp_path: Path, checkpoint: Path) -> None:
     actions = []
     for behaviour in (None, "reach", "explore"):
         settings = Collection(steps=10, policy=str(checkpoint), behaviour=behaviour, workers=0)
-        policy = collecting_policy(settings, make_task("reacher", **OPTIONS))
+        policy = collecting_policy(settings, "reacher", OPTIONS)
         folder = tmp_path / str(behaviour)
         dataset = collect(folder, "reacher", settings, policy=policy, options=OPTIONS, progress=False)
         assert dataset.metadata["policies"] == {f"{checkpoint} ({behaviour})" if behaviour else str(checkpoint): 1}

@@ -18,6 +18,7 @@ from torchrl_ocwm.agents.presets import flat
 from torchrl_ocwm.data.policies import POLICIES
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.devices import usable_device
+from torchrl_ocwm.envs.registry import make_task
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.parts import VARIABLE, absent, foreign
 from torchrl_ocwm.settings import Settings, SettingsError, from_dict, to_dict
@@ -72,12 +73,15 @@ def load_agent(path: str | Path, *, behaviour: str | None = None, device: torch.
     return agent.policy(behaviour)
 
 
-def collecting_policy(settings: Collection, task: Task) -> Policy | None:
+def collecting_policy(
+    settings: Collection, environment: str, options: Mapping[str, Any] | None = None
+) -> Policy | None:
     """The policy that collects, where its settings name the checkpoint of an agent; ``None`` for a policy by name.
 
     Args:
         settings: The collection's, with the checkpoint under ``policy``.
-        task: The task that is collected for.
+        environment: Name of the environment that it collects in.
+        options: Passed to the environment.
 
     Raises:
         SettingsError: if there is no such file, it is of another task's agent, or the agent lacks the behaviour.
@@ -87,7 +91,7 @@ def collecting_policy(settings: Collection, task: Task) -> Policy | None:
         return None
     if not Path(settings.policy).is_file():
         raise SettingsError(f"policy must be {', '.join(POLICIES)} or a checkpoint file, got {settings.policy!r}")
-    policy = load_agent(settings.policy, behaviour=settings.behaviour)
+    policy, task = load_agent(settings.policy, behaviour=settings.behaviour), make_task(environment, **(options or {}))
     if policy.agent.task != task:
         raise SettingsError(
             f"policy={settings.policy}: the agent was trained for {policy.agent.task.name!r} with options "

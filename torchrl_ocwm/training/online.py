@@ -19,7 +19,7 @@ from torchrl_ocwm.data import EpisodeDataset, episode_to_records
 from torchrl_ocwm.data.collect import STORED, check_failures, collect, count_episode
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.devices import usable_device
-from torchrl_ocwm.envs import find_environment, make_env, make_task
+from torchrl_ocwm.envs import find_environment, make_env
 from torchrl_ocwm.settings import from_dict
 from torchrl_ocwm.training.collectors import NUMBER, Turns, end, make_collector, next_episodes, send_weights
 from torchrl_ocwm.training.hooks import ProgressBar, StopOnSignals, UpdateClock
@@ -59,7 +59,7 @@ def collect_seed_steps(
     shared = Collection(seed=seed, workers=online.workers, timeout=online.timeout)
     for policy, steps in zip(online.seed_policy, accumulate(online.seed_steps), strict=True):
         settings = replace(shared, policy=policy, steps=steps)
-        acts = collecting_policy(settings, make_task(environment, **(options or {})))
+        acts = collecting_policy(settings, environment, options)
         collect(path, environment, settings, policy=acts, options=options, progress=progress)
     return EpisodeDataset.open(path, write=True)
 
