@@ -1,0 +1,99 @@
+"""What the page of Cube move says is in the files beside it."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from reading import RESULTS, curve, diagnosis, mean, page, report, settings, unchecked
+
+#: What was done, or what the paper says: no file beside the page has these numbers.
+STATED = [
+    "after 100 minutes on two CPU cores",
+    "after 250,000 updates of a larger model the paper reports 0.35 ± 0.05 for Dreamer, 0.75 ± 0.04 for FOCUS + PCP "
+    "and 0.73 ± 0.05 for FOCUS + LCP",
+    "Dreamer has 7,500 on the data that they left",
+    "had images of 64 × 64, episodes of 250 steps, scripts without misses, at most two "
+    "rounds and 4,000 to 10,000 updates",
+    "At commit c1b4e61 on 2026-11-25",
+    "28,000 steps of scripted and random actions took 14 minutes",
+    "5,000 updates of both agents side by side 24 minutes",
+    "3,900 steps by each agent and 2,500 updates of both, 15 to 17 minutes",
+    "the cube moves in 35% of 59,500 steps, and visits 100% of the workspace",
+    "instead of 5, for lack of time",
+    "with the names that settings had in release 0.1",
+    "250,000 updates of each agent on some 975,000 steps in the end",
+]
+
+
+def protocol() -> list[str]:
+    """How the runs were made."""
+    numbers, runs = report("cube_move"), [settings("cube_move", f"focus_{name}_seed_0") for name in ("pcp", "lcp")]
+    goals, steps = (
+        len(numbers.goals),
+        json.loads((RESULTS / "cube_move" / "results.json").read_text())["settings"]["episode_steps"],
+    )
+    (updates,) = {run["training"]["updates"] for run in runs}
+    (image,) = {run["env"]["options"]["image_size"] for run in runs}
+    looked_at = json.loads((RESULTS / "cube_move" / "diagnosis" / "diagnosis.json").read_text())["settings"]
+    side = math.isqrt(goals)
+    return [
+        f"{goals} goals, a {side} × {side} grid over the workspace; {steps} steps each",
+        f"FOCUS + PCP and FOCUS + LCP have {updates:,} here",
+        f"of FOCUS + LCP on {looked_at['sequences']} sequences of its data",
+        f"at {image} × {image} the cube",
+    ]
+
+
+def measured() -> list[str]:
+    numbers = report("cube_move")
+    goals, after = diagnosis("cube_move")
+    scores = {name: curve(RESULTS / "cube_move" / f"focus_{name}_seed_0.csv") for name in ("pcp", "lcp")}
+    rounds = {
+        name: ", ".join(f"{values[step]:.2f}" for step in (7500, 10000, 12500, 15000))
+        for name, values in scores.items()
+    }
+    score = {agent: mean(numbers, agent, "final_score") for agent in numbers.rows}
+    missed = [int((numbers.rows[f"focus_{name}"].seeds[0]["success"] == 0).sum()) for name in ("pcp", "lcp")]
+    imagined, real = (
+        [mean(numbers, f"focus_{name}", metric, 100) for name in ("pcp", "lcp")]
+        for metric in ("imagined_distance", "final_distance")
+    )
+    for name in ("pcp", "lcp"):
+        returns = curve(RESULTS / "cube_move" / f"focus_{name}_seed_0_imagined_return.csv")
+        assert min(returns, key=lambda step: returns[step]) == pytest.approx(600, abs=100)
+    frames = goals["position, frame"], goals["image, frame"]
+    apart = [1000 * one["distance"] for one in frames]
+    metrics = ("imagined_distance", "goal_error", "entity_error")
+    expected, goal, known = (mean(numbers, "dreamer", metric, 100) for metric in metrics)
+    return [
+        f"within 5 cm of {mean(numbers, 'focus_pcp', 'success'):.0%} of its goals",
+        f"expects to end {expected:.0f} cm from the goal, and does",
+        f"of its goal is {goal:.0f} cm off, while it knows the cube to {known:.1f} cm",
+        "falls for 600 updates and then rises",
+        "is about that of doing nothing after 5,000 updates on scripted and random data",
+        f"{scores['pcp'][5000]:.2f} for PCP and {scores['lcp'][5000]:.2f} for LCP. After the four rounds",
+        f"{rounds['pcp']} for [PCP]",
+        f"{rounds['lcp']} for [LCP]",
+        f"more than 5 cm off for {missed[0]} of 36 goals with PCP and {missed[1]} with LCP",
+        f"expect to end {imagined[0]:.1f} and {imagined[1]:.1f} cm off on average",
+        f"where it is {real[0]:.1f} and {real[1]:.1f}",
+        f"LCP is behind PCP by {score['focus_pcp'] - score['focus_lcp']:.2f}, "
+        f"image goals by {score['focus_lcp'] - score['focus_lcp, image goals']:.2f} more",
+        f"Seen frames give the position to {after['filtered']['median']:.0f} mm in the median, "
+        f"and imagined ones to {after['imagined']['median']:.0f} mm after 15 steps",
+        f"better in the median ({after['unmoved']['median']:.0f} mm)",
+        f"({after['unmoved']['upper']:.0f} mm against {after['imagined']['upper']:.0f} mm)",
+        f"{apart[0]:.1f} mm beside it on average ({apart[1]:.1f} mm for an image)",
+        f"for {frames[0]['ranked_first']:.0%} of positions",
+    ]
+
+
+@pytest.mark.parametrize("sentence", [*measured(), *protocol(), *STATED])
+def test_sentence(sentence: str) -> None:
+    assert sentence in page("cube_move")
+
+
+def test_no_number_is_unchecked() -> None:
+    assert unchecked("cube_move", [*measured(), *protocol(), *STATED]) == []

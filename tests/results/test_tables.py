@@ -1,0 +1,25 @@
+"""Tables on pages are those of the numbers beside them."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from reading import RESULTS, ROOT, cell, report
+
+
+@pytest.mark.parametrize("name", ["reacher", "reacher/ablations", "cube_move"])
+def test_tables_are_those_of_the_numbers(name: str) -> None:
+    table = report(name).markdown()
+    assert (RESULTS / name / "results.md").read_text() == table + "\n"
+    if (RESULTS / name / "README.md").exists():
+        assert table in (RESULTS / name / "README.md").read_text()
+
+
+def test_tables_of_the_readme() -> None:
+    text = (ROOT / "README.md").read_text()
+    for name in ("reacher", "cube_move"):
+        for agent in report(name).rows:
+            shown = f"`{agent}`".replace(", image goals`", "`, goals as images").replace("`random`", "random actions")
+            score = cell(report(name), agent, "final_score")
+            assert re.search(rf"^\| {shown}(, 7,500 updates.*)? \| {score} \|$", text, re.MULTILINE), (name, agent)
