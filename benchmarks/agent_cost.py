@@ -1,6 +1,6 @@
 """Seconds per update, peak memory and the share of each part, of every agent, beside a reference timed in the same run.
 
-    python benchmarks/agent_cost.py [--agents dreamer focus_lcp ...] [--sizes cpu peer paper] [--threads 2]
+    python benchmarks/agent_cost.py [--agents dreamer focus_lcp ...] [--sizes cpu small paper] [--threads 2]
         [--rounds 10] [--updates 1] [--budget 60] [--device cpu] [--compile]
         [--mixed-precision]
 
@@ -27,9 +27,6 @@ clock is read at every cut. The parts, each forward and backward:
 
 They are medians of seconds over their sum, and so add up to one. How long such updates take, compared with the ones
 that were timed whole, is printed below the table; if it is far from 1, do not trust the shares.
-
-The peer is a public release of the paper, measured on two quiet cores of another machine: "peer / ours" compares
-machines too, where these are not alike. Its sizes are "peer" (batch 8 x 16, CNN depth 16) and "paper".
 """
 
 from __future__ import annotations
@@ -44,7 +41,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -55,7 +52,6 @@ from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.envs.workspace import Workspace
-from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_stepper
@@ -63,44 +59,8 @@ from torchrl_ocwm.training.stepper import make_stepper
 T = TypeVar("T")
 
 TASK = Task("benchmark", 64, ("object",), 50, 4, Workspace(low=(-0.3, -0.3, 0.0), high=(0.3, 0.3, 0.3)))
-PEER_SIZE = change(
-    SIZES["paper"],
-    {
-        "architecture.cnn_depth": 16,
-        "architecture.object_features": 32 * 16,
-        "learning.batch_size": 8,
-        "learning.slice_len": 16,
-        "learning.imagination_horizon": 15,
-    },
-)
-ALL_SIZES = {**SIZES, "peer": PEER_SIZE}
 PARTS = ("encoder", "RSSM", "decoders", "imagination", "optimiser", "other")
 LEAST_ROUNDS = 3
-
-
-class Peer(NamedTuple):
-    """What a public release of the paper takes on two quiet cores of another machine."""
-
-    seconds: float
-    mib: int
-
-
-PEER = {
-    "peer": {
-        "dreamer": Peer(0.62, 918),
-        "dreamer_pcp": Peer(0.86, 896),
-        "focus": Peer(0.80, 1109),
-        "focus_pcp": Peer(0.81, 1121),
-        "focus_lcp": Peer(0.97, 1150),
-    },
-    "paper": {
-        "dreamer": Peer(12.9, 3603),
-        "dreamer_pcp": Peer(11.8, 3643),
-        "focus": Peer(19.2, 4864),
-        "focus_pcp": Peer(22.1, 5029),
-        "focus_lcp": Peer(22.0, 4750),
-    },
-}
 
 
 def clock(device: str) -> float:
@@ -248,7 +208,7 @@ def peak_mib(device: str) -> float:
 
 def make_update(name: str, size: str, training: Training) -> tuple[Agent, DreamerV3OptimizationStepper]:
     """An agent and its stepper."""
-    agent = build_agent(name, TASK, ALL_SIZES[size]).to(training.device).train()
+    agent = build_agent(name, TASK, SIZES[size]).to(training.device).train()
     return agent, make_stepper(agent, training)
 
 
@@ -294,7 +254,7 @@ def child(arguments: argparse.Namespace) -> None:
     """Measure one agent at one size, and print it as JSON."""
     torch.set_num_threads(arguments.threads)
     torch.manual_seed(0)
-    size = ALL_SIZES[arguments.child[1]].learning
+    size = SIZES[arguments.child[1]].learning
     batch = random_records(TASK, size.batch_size, size.slice_len).to(arguments.device)
     result = measure_whole(batch, arguments)  # first, so that the peak is its own
     print(json.dumps({**result, "parts": measure_parts(batch, arguments)}))
@@ -309,15 +269,12 @@ def run_child(agent: str, size: str) -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def row(agent: str, size: str, result: dict[str, Any]) -> str:
+def row(agent: str, result: dict[str, Any]) -> str:
     """A row of the table."""
     seconds, mib = statistics.median(result["update"]), result["mib"]
     rounds = zip(result["update"], result["product"], result["convolutions"], strict=True)
     multiple = statistics.median(update / (product + convolutions) for update, product, convolutions in rounds)
     cells = [agent, f"{seconds:.3g}", f"{multiple:.1f}", f"{mib:.0f}"]
-    peer = PEER.get(size, {}).get(agent)
-    cells += [f"{peer.seconds:.3g}", f"{peer.seconds / seconds:.2f}"] if peer else ["–"] * 2
-    cells += [f"{peer.mib}", f"{peer.mib / mib:.2f}"] if peer else ["–"] * 2
     whole = sum(result["parts"].values())
     return line([*cells, *(f"{result['parts'][part] / whole:.2f}" for part in PARTS)])
 
@@ -334,15 +291,14 @@ def spread(values: Sequence[float], form: str) -> str:
 
 def print_table(size: str, agents: Sequence[str], updates: int) -> None:
     """Measure the agents at a size, with a row as soon as there is one."""
-    sizes, results = ALL_SIZES[size], []
+    sizes, results = SIZES[size], []
     batch, depth = (sizes.learning.batch_size, sizes.learning.slice_len), sizes.architecture.cnn_depth
     print(f"\nSize {size}: {batch[0]} sequences of {batch[1]} frames, CNN depth {depth}\n")
-    peer = ["peer s", "peer s / ours", "peer MiB", "peer MiB / ours"]
-    head = ["agent", "s/update", "x reference", "peak MiB", *peer, *PARTS]
+    head = ["agent", "s/update", "x reference", "peak MiB", *PARTS]
     print(line(head), line(["---", *["---:"] * (len(head) - 1)]), sep="\n", flush=True)
     for agent in agents:
         results.append(run_child(agent, size))
-        print(row(agent, size, results[-1]), flush=True)
+        print(row(agent, results[-1]), flush=True)
 
     rounds = spread([len(result["update"]) for result in results], "d")
     product, convolutions = (
@@ -365,7 +321,7 @@ def positive(text: str) -> int:
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--agents", nargs="+", choices=AGENTS, default=list(AGENTS), metavar="AGENT")
-    parser.add_argument("--sizes", nargs="+", choices=ALL_SIZES, default=["cpu", "peer", "paper"], metavar="SIZE")
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=["cpu", "small"], metavar="SIZE")
     parser.add_argument("--threads", type=positive, default=2)
     parser.add_argument("--rounds", type=positive, default=10, help="at most, for the updates and again for the parts")
     parser.add_argument("--updates", type=positive, default=1, help="updates per round")
@@ -389,12 +345,6 @@ def main() -> None:
     precision = "bfloat16" if arguments.mixed_precision else "float32"
     print(f"torch {torch.__version__}, {arguments.device}, {precision}, {arguments.threads} threads", end="")
     print(f" on {os.cpu_count()} cores; medians of at most {arguments.rounds} rounds of {arguments.updates} updates")
-    if any(size in PEER for size in arguments.sizes):
-        print(
-            "Peer: a public release of the paper, on two quiet cores of another machine; peer / ours above 1: it ",
-            end="",
-        )
-        print("takes more than ours")
     for size in arguments.sizes:
         print_table(size, arguments.agents, arguments.updates)
 

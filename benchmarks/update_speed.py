@@ -1,120 +1,224 @@
-"""Updates per second, and how much of an update is spent on sampling from the dataset (the goal: below 10 %).
+"""How much of what the processor can do goes into updates: GFLOP, operations and seconds of one, and its efficiency.
 
-    python benchmarks/update_speed.py [--agent dreamer_pcp] [--size cpu] [--threads 1] [--rounds 20] [--updates 10]
-        [--dataset DATASET] [--device cpu] [--compile]
+    python benchmarks/update_speed.py [--agents dreamer_pcp focus_lcp ...] [--sizes cpu small] [--rounds 9]
+        [--updates 2] [--threads 1] [--device cpu] [--mixed-precision] [--compile] [--before COMMIT]
 
-An update is a sample from the dataset, with fresh goals, and a step of the stepper on it, as in training: one process,
-one after the other, so that a noisy machine slows both. Without a dataset a temporary one of 20,000 random steps is
-made (0.3 GB); it comes from the system's cache, as one does that fits in memory.
+A round times a plain product of two 1024 x 1024 matrices in float32 and some updates on random records, so that a noisy
+machine slows both. Efficiency is the GFLOP of an update by the seconds it takes and the GFLOP/s of the product in the
+same round; 1 would be an update that does nothing but products of this kind. All numbers are medians over rounds.
+
+GFLOP are those of products and convolutions, forward and backward, as PyTorch's ``flop_counter`` counts them, by a
+dispatch mode of our own: ``FlopCounterMode`` cannot walk the parameters of a loss module. Operations are all calls that
+reach PyTorch's dispatcher in an eager update.
+
+``--before`` measures another commit too, in a worktree of git and in turns with this one, and says how much faster
+this one is, in times. It needs the settings of today, so that 45c8d50 is the earliest.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import flop_registry
 
-from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
-from torchrl_ocwm.data import EpisodeDataset, RelabelGoals, make_replay_buffer
-from torchrl_ocwm.envs import Task
-from torchrl_ocwm.testing import random_dataset, reacher_task
+from torchrl_ocwm.agents import AGENTS, SIZES, build_agent
+from torchrl_ocwm.testing import random_records, reacher_task
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_stepper
 
-EPISODES, LENGTH = 40, 501
+ROOT = Path(__file__).parents[1]
+HEAD = ["agent", "GFLOP", "operations", "s/update", "product, GFLOP/s", "efficiency"]
+SIDE = 1024
+#: Options that a child needs, as it measures one agent at one size.
+SHARED = ("rounds", "updates", "threads", "device", "mixed_precision", "compile")
 
 
-def make_sampler(agent: Agent, dataset: EpisodeDataset, device: str) -> Callable[[], TensorDictBase]:
-    """Batches as in training."""
-    replay = make_replay_buffer(
-        dataset,
-        batch_size=agent.size.learning.batch_size,
-        slice_len=agent.size.learning.slice_len,
-        transform=RelabelGoals(agent.task.workspace),
-    )
-    return lambda: replay.sample().to(device)
+class Work(TorchDispatchMode):
+    """What is computed inside: ``flop`` of products and convolutions, and the number of all ``operations``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.flop = self.operations = 0
+
+    def __torch_dispatch__(
+        self, function: Any, types: Any, args: Sequence[Any] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        result = function(*args, **(kwargs or {}))
+        self.operations += 1
+        count = flop_registry.get(function._overloadpacket)
+        if count is not None:
+            self.flop += count(*args, **(kwargs or {}), out_val=result)
+        return result
 
 
-def clock(device: str) -> float:
-    """Seconds, after what was sent to a GPU is done."""
-    if torch.device(device).type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
+class Update:
+    """An agent's update on random records, and the product it is compared with."""
+
+    def __init__(self, agent: str, size: str, options: dict[str, Any]) -> None:
+        torch.set_num_threads(options["threads"])
+        torch.manual_seed(0)
+        self.device, self.updates = options["device"], options["updates"]
+        built = build_agent(agent, reacher_task(), size).to(self.device).train()
+        precision = {"mixed_precision": options["mixed_precision"]}
+        self.eager = make_stepper(built, Training(device=self.device, compile=False, cudagraph=False, **precision))
+        self.stepper = make_stepper(built, Training(device=self.device, compile=options["compile"], **precision))
+        learning = SIZES[size].learning
+        self.batch = random_records(reacher_task(), learning.batch_size, learning.slice_len).to(self.device)
+        self.matrix = torch.rand(SIDE, SIDE, device=self.device)
+
+    def count(self) -> Work:
+        """The work of an eager update."""
+        self.eager.step(None, self.batch.copy())
+        with Work() as work:
+            self.eager.step(None, self.batch.copy())
+        return work
+
+    def warmup(self) -> None:
+        """Compile, where it is asked for."""
+        if any(self.stepper.resolve(torch.device(self.device))):
+            self.stepper.warmup(self.batch.copy())
+        self.round()
+
+    def round(self) -> tuple[float, float]:
+        """Seconds of an update, and of the product."""
+        update = self._seconds(lambda: self.stepper.step(None, self.batch.copy()), self.updates)
+        return update, self._seconds(lambda: self.matrix @ self.matrix, 3)
+
+    def _seconds(self, function: Any, times: int) -> float:
+        start = self._clock()
+        for _ in range(times):
+            function()
+        return (self._clock() - start) / times
+
+    def _clock(self) -> float:
+        if torch.device(self.device).type == "cuda":
+            torch.cuda.synchronize(self.device)
+        return time.perf_counter()
 
 
-def turn(
-    sample: Callable[[], TensorDictBase], step: Callable[[TensorDictBase], object], device: str, updates: int
-) -> tuple[float, float]:
-    """Seconds per sample and per step."""
-    sampling = stepping = 0.0
-    for _ in range(updates):
-        start = clock(device)
-        batch = sample()
-        middle = clock(device)
-        step(batch)
-        sampling, stepping = sampling + middle - start, stepping + clock(device) - middle
-    return sampling / updates, stepping / updates
+def serve(agent: str, size: str, options: dict[str, Any]) -> None:
+    """Measure a round for each line of the standard input; the first line printed is the work of an update."""
+    update = Update(agent, size, options)
+    work = update.count()
+    update.warmup()
+    print(json.dumps([work.flop, work.operations]), flush=True)
+    for _ in sys.stdin:
+        print(json.dumps(update.round()), flush=True)
 
 
-def measure(dataset: EpisodeDataset, arguments: argparse.Namespace) -> tuple[list[float], list[float]]:
-    """Seconds per sample and per step, for each round."""
-    device = arguments.device
-    agent = build_agent(arguments.agent, Task.from_dict(dataset.metadata["task"]), arguments.size).to(device).train()
-    stepper = make_stepper(agent, Training(device=device, compile=arguments.compile))
-    sample = make_sampler(agent, dataset, device)
-    if any(stepper.resolve(torch.device(device))):
-        stepper.warmup(sample())
+class Child:
+    """An :class:`Update` in a process of its own, with the library of a folder."""
 
-    def step(batch: TensorDictBase) -> object:
-        return stepper.step(None, batch)
+    def __init__(self, folder: Path, agent: str, size: str, options: dict[str, Any]) -> None:
+        command = [sys.executable, __file__, "--child", agent, size, json.dumps(options)]
+        environment = {**os.environ, "PYTHONPATH": str(folder)}
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment)
+        self.flop, self.operations = self._read()
 
-    turn(sample, step, device, arguments.updates)
-    rounds = [turn(sample, step, device, arguments.updates) for _ in range(arguments.rounds)]
-    sampling, stepping = zip(*rounds, strict=True)
-    return list(sampling), list(stepping)
+    def round(self) -> tuple[float, float]:
+        """Seconds of an update and of the product, in this turn."""
+        assert self.process.stdin is not None
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        update, product = self._read()
+        return update, product
+
+    def close(self) -> None:
+        """End the process."""
+        self.process.communicate()
+
+    def _read(self) -> list[Any]:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise SystemExit(f"the measurement failed with exit code {self.process.wait()}")
+        return json.loads(line)
+
+
+@contextmanager
+def checkout(commit: str) -> Iterator[Path]:
+    """A folder with the files of a commit."""
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder, "tree")
+        git = ["git", "-C", str(ROOT), "worktree"]
+        subprocess.run([*git, "add", "--quiet", "--detach", str(tree), commit], check=True)
+        try:
+            yield tree
+        finally:
+            subprocess.run([*git, "remove", "--force", str(tree)], check=True)
+
+
+def row(agent: str, children: Sequence[Child], rounds: int) -> list[str]:
+    """A row of the table: of the first child, and how many times faster it is than the other, if there is one."""
+    first, *others = children
+    times = [[child.round() for child in children] for _ in range(rounds)]
+    update = statistics.median(turn[0][0] for turn in times)
+    rate = statistics.median(2 * SIDE**3 / turn[0][1] for turn in times)
+    efficiency = statistics.median(first.flop * turn[0][1] / (turn[0][0] * 2 * SIDE**3) for turn in times)
+    cells = [agent, f"{first.flop / 1e9:.1f}", f"{first.operations:,}", f"{update:.3g}", f"{rate / 1e9:.1f}"]
+    cells.append(f"{efficiency:.2f}")
+    for other, child in enumerate(others, 1):
+        cells += [f"{child.operations:,}", f"{statistics.median(turn[other][0] / turn[0][0] for turn in times):.2f}"]
+    return cells
+
+
+def line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def print_table(size: str, folders: Sequence[Path], arguments: argparse.Namespace) -> None:
+    """A row for each agent, as soon as it is measured."""
+    head = HEAD + (["operations before", "times faster"] if len(folders) > 1 else [])
+    print(f"\nSize {size}\n\n{line(head)}\n{line(['---', *['---:'] * (len(head) - 1)])}", flush=True)
+    options = {name: getattr(arguments, name) for name in SHARED}
+    for agent in arguments.agents:
+        with ExitStack() as stack:
+            children = [Child(folder, agent, size, options) for folder in folders]
+            for child in children:
+                stack.callback(child.close)
+            print(line(row(agent, children, arguments.rounds)), flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--agent", choices=AGENTS, default="dreamer_pcp")
-    parser.add_argument("--size", choices=SIZES, default="cpu")
+    parser.add_argument("--agents", nargs="+", choices=AGENTS, default=list(AGENTS), metavar="AGENT")
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=["cpu", "small"], metavar="SIZE")
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--updates", type=int, default=2, help="updates per round")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--updates", type=int, default=10, help="updates per round")
-    parser.add_argument("--dataset")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument(
-        "--compile",
-        action=argparse.BooleanOptionalAction,
-        help="compile the step, which takes minutes; by default as in training, on a GPU only",
-    )
+    parser.add_argument("--mixed-precision", action="store_true", help="products and convolutions in bfloat16")
+    parser.add_argument("--compile", action=argparse.BooleanOptionalAction, help="by default as in training")
+    parser.add_argument("--before", metavar="COMMIT", help="a commit to compare with")
+    parser.add_argument("--child", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    torch.manual_seed(0)
-
-    with tempfile.TemporaryDirectory() as folder:
-        dataset = (
-            EpisodeDataset.open(arguments.dataset)
-            if arguments.dataset
-            else random_dataset(f"{folder}/data", reacher_task(), episodes=EPISODES, length=LENGTH)
-        )
-        sampling, stepping = measure(dataset, arguments)
-
-    whole = [sum(parts) for parts in zip(sampling, stepping, strict=True)]
-    share = statistics.median(part / update for part, update in zip(sampling, whole, strict=True))
-    size = SIZES[arguments.size].learning
-    print(f"{arguments.agent}, size {arguments.size}, {size.batch_size} sequences of {size.slice_len} frames", end="")
-    print(f", {dataset.num_steps} steps; {arguments.device}, {arguments.threads} threads", end="")
-    print(f", median of {arguments.rounds} rounds of {arguments.updates} updates")
-    for name, values in {"sample": sampling, "step": stepping, "update": whole}.items():
-        print(f"{name:24}{1000 * statistics.median(values):10.2f} ms")
-    print(f"{'updates/s':24}{1 / statistics.median(whole):10.2f}")
-    print(f"{'sampling / update':24}{share:10.1%}")
+    if arguments.child:
+        agent, size, options = arguments.child
+        serve(agent, size, json.loads(options))
+        return
+    precision = "bfloat16" if arguments.mixed_precision else "float32"
+    print(f"torch {torch.__version__}, {arguments.device}, {precision}, {arguments.threads} threads", end="")
+    print(f"; medians of {arguments.rounds} rounds of {arguments.updates} updates")
+    with ExitStack() as stack:
+        folders = [ROOT]
+        if arguments.before:
+            folders.append(stack.enter_context(checkout(arguments.before)))
+        for size in arguments.sizes:
+            print_table(size, folders, arguments)
 
 
 if __name__ == "__main__":

@@ -39,7 +39,6 @@ def test_cost_of_agents_is_a_table_with_shares_that_add_up() -> None:
     for row in rows:
         cells = dict(zip(head, row, strict=True))
         assert min(float(cells[name]) for name in ("s/update", "x reference", "peak MiB")) > 0
-        assert cells["peer s"] == "–"  # the peer has no such size
         shares = [float(cells[name]) for name in head[-6:]]
         assert all(0 <= share <= 1 for share in shares)
         assert sum(shares) == pytest.approx(1, abs=0.031)  # six rounded numbers
@@ -48,7 +47,7 @@ def test_cost_of_agents_is_a_table_with_shares_that_add_up() -> None:
 # Gradients of focus_lcp are added up in another order; what that changes, the optimiser would magnify.
 @pytest.mark.parametrize(("name", "updates"), [("dreamer", 3), ("focus_lcp", 1)])
 def test_update_cut_into_parts_is_the_update(agent_cost: ModuleType, name: str, updates: int) -> None:
-    size = agent_cost.ALL_SIZES["debug"].learning
+    size = agent_cost.SIZES["debug"].learning
     batch = agent_cost.random_records(agent_cost.TASK, size.batch_size, size.slice_len)
     weights = []
     for cut in (False, True):
@@ -62,10 +61,3 @@ def test_update_cut_into_parts_is_the_update(agent_cost: ModuleType, name: str, 
     assert whole.keys() == parts.keys()
     for key, value in whole.items():
         torch.testing.assert_close(parts[key], value, msg=key)
-
-
-def test_sizes_of_the_peer(agent_cost: ModuleType) -> None:
-    for size, figures in agent_cost.PEER.items():
-        assert size in agent_cost.ALL_SIZES
-        assert set(figures) <= set(agent_cost.AGENTS)
-    assert agent_cost.PEER_SIZE.architecture.style == agent_cost.SIZES["paper"].architecture.style
