@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from torchrl_ocwm.agents import build_agent, save_agent
-from torchrl_ocwm.data.collect import CollectionError
+from torchrl_ocwm.data import CollectionError
 from torchrl_ocwm.data.dataset import DatasetError
 from torchrl_ocwm.devices import DeviceError
 from torchrl_ocwm.envs import registry
