@@ -19,6 +19,7 @@ from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.evaluation import (
     Diagnosis,
+    check_ffmpeg,
     draw_errors,
     draw_goal_latents,
     latent_pairs,
@@ -64,6 +65,8 @@ class Diagnose(Diagnosis):
 @ended_by_signals()
 def main(config: Diagnose) -> None:
     settings, output = config, Path(config.output)
+    if settings.video_sequences:
+        check_ffmpeg("video_sequences")
     agent = load_agent(config.checkpoint, device=settings.device).agent
     records = _records(Path(config.dataset), config.checkpoint, agent.task, settings)
     torch.manual_seed(settings.seed)

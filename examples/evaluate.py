@@ -27,6 +27,7 @@ from torchrl_ocwm.evaluation import (
     EvaluationEnvs,
     ReconstructionError,
     Report,
+    check_ffmpeg,
     decode_video,
     draw_errors,
     episode_records,
@@ -85,6 +86,8 @@ class Evaluate(Evaluation):
 @ended_by_signals()
 def main(config: Evaluate) -> None:
     settings = config
+    if settings.video_goals:
+        check_ffmpeg("video_goals")
     files = [Path(one) for one in ([config.checkpoint] if isinstance(config.checkpoint, str) else config.checkpoint)]
     policies = [load_agent(file, behaviour=settings.behaviour) for file in files]
     task, about, output = _one_task(policies, files), policies[0].object_index, Path(config.output)

@@ -66,7 +66,7 @@ def main(config: TrainOnline) -> None:
                 LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps)
             )
         if training.video_interval:
-            check_ffmpeg()
+            check_ffmpeg("training.video_interval")
         path = Path(config.dataset or folder / "data")
         with ended_by_signals():
             dataset = collect_seed_steps(path, name, config.online, seed=training.seed, options=options)

@@ -117,7 +117,7 @@ AGENTS["near_disc"] = change(AGENTS["dreamer_pcp"], {"behaviours.reach.reward": 
 
 
 def main(
-    steps: int = 2000, updates: int = 300, goals: int = 9, output: str = "outputs/disc", seed: int = 0
+    steps: int = 2000, updates: int = 1500, goals: int = 9, output: str = "outputs/disc", seed: int = 0
 ) -> dict[str, float]:
     dataset = collect(Path(output, "data"), "disc", steps, seed=seed, workers=0)
     task = dataset.task
@@ -137,7 +137,7 @@ def main(
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=2000, help="environment steps to collect")
-    parser.add_argument("--updates", type=int, default=300)
+    parser.add_argument("--updates", type=int, default=1500)
     parser.add_argument("--goals", type=int, default=9, help="of the evaluation, a square number")
     parser.add_argument("--output", default="outputs/disc")
     parser.add_argument("--seed", type=int, default=0)

@@ -28,6 +28,7 @@ REFUSED = """
 collect dataset=null                               dataset must be a text, got None
 collect dataset=[a,b]                              dataset must be a text, got ['a', 'b']
 collect dataset=???                                dataset is missing
+collect env=null                                   env must be one of
 collect env.name=foo                               env.name must be one of reacher, cube_move, shelf_place, pick_place,
 collect env.name=null                              env.name must be a text, got None
 collect env.options=null                           env.options must be a mapping of names, got None
@@ -96,6 +97,10 @@ evaluate seed=null                                 seed must be a whole number, 
 evaluate video_goals=-1                            video_goals must be at least 0, got -1
 evaluate workers=-1                                workers must be at least 0, got -1
 evaluate workers=abc                               workers must be a whole number, got 'abc'
+train_offline agent=null                           agent must be one of
+train_offline agent=NULL                           agent must be one of
+train_offline explore=null                         explore must be one of
+train_offline size=null                            size must be one of
 train_offline agent.lambda_proprio=null            agent.lambda_proprio is no setting; there are world_model, behaviours
 train_offline size.batch_size=100000000            size.batch_size is no setting; there are architecture, learning
 train_offline size.cnn_mults=3                     size.cnn_mults is no setting; there are architecture, learning
@@ -241,6 +246,14 @@ class TestGroups:
         assert said.startswith("SettingsError: env.options.objects must be [cube] or [cube, distractor]")
         said = compose("collect", "+env.options.objects=[cube,distractor]")  # of Reacher
         assert said.startswith("SettingsError: env.options.objects is no setting")
+
+    def test_a_group_without_a_choice(self) -> None:
+        """In a process of its own: other tests fill Hydra's store."""
+        script = str(EXAMPLES / "collect.py")
+        done = subprocess.run([sys.executable, script, "env=null"], capture_output=True, text=True, check=False)
+        names = "cube_move, pick_place, reacher, shelf_place"
+        assert done.stderr.splitlines()[-1] == f"SettingsError: env must be one of {names}, got null"
+        assert "Traceback" not in done.stderr
 
     def test_a_checkpoint_or_several(self, compose: Callable[..., Any]) -> None:
         assert compose("evaluate", "checkpoint=a.zip").checkpoint == "a.zip"

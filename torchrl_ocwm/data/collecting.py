@@ -11,6 +11,7 @@ from contextlib import ExitStack, closing
 from functools import partial
 from itertools import count, cycle
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import torch
@@ -20,7 +21,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_ocwm.data.coverage import dataset_coverage
-from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
+from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset, refuse_another
 from torchrl_ocwm.data.policies import POLICIES, ScriptedPolicy
 from torchrl_ocwm.data.records import STORED, episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
@@ -251,7 +252,14 @@ def with_coverage(dataset: EpisodeDataset, task: Task) -> EpisodeDataset:
 
 
 def _open_if_there(path: Path, source: dict[str, Any]) -> EpisodeDataset | None:
+    """The dataset in a folder to which can be written; ``None`` if there is none yet."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=path).close()
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot write a dataset here ({error.strerror or error})") from error
     if not (path / "dataset.json").exists():
+        refuse_another(path)
         return None
     dataset = EpisodeDataset.open(path, write=True)  # it may have been killed before the first episode
     there = {key: dataset.metadata.get(key) for key in source}
