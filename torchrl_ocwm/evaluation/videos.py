@@ -173,6 +173,7 @@ class OpenLoopFilm:
 
     @torch.no_grad()
     def __call__(self, updates: int) -> Path:
+        """Write the video of this many updates."""
         model, device = self.agent.model, next(self.agent.parameters()).device
         latents = open_loop_latents(model, self.records.to(device), self.context)
         truth, predicted = self.records["next", "pixels"], decode_video(model, latents).cpu()
