@@ -276,12 +276,12 @@ def test_file_that_is_no_checkpoint(tmp_path, no_collector):
 
 def test_a_place_for_no_dataset_is_refused_before_an_episode_is_played(tmp_path, no_collector):
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(DatasetError, match=r"/file: cannot write a dataset here \(File exists\)"):
+    with pytest.raises(DatasetError, match=r"/file: cannot write a dataset here \(Not a directory\)"):
         gather(tmp_path / "file", 20)
     with pytest.raises(DatasetError, match=r"/file/data: cannot write a dataset here \(Not a directory\)"):
         gather(tmp_path / "file" / "data", 20)
     with pytest.raises(DatasetError, match=r"cannot write a dataset here"):
-        gather("/proc/self", 20)
+        gather("/proc/data", 20)
     left = tmp_path / "left" / "frames" / "reward.memmap"
     left.parent.mkdir(parents=True)
     left.touch()

@@ -283,13 +283,13 @@ class TestHydra:
         assert "dataset=data/{env.name}: Folder of the dataset to train on (collect)." in lines
 
     def test_takes_a_file_of_ones_own(self, compose: Callable[..., Any], tmp_path: Path) -> None:
-        (tmp_path / "mine.yaml").write_text(
+        (tmp_path / "of_ones_own.yaml").write_text(
             "defaults: [train_offline, {override agent: focus}, _self_]\ntraining: {updates: 3}\n"
         )
-        arguments = ("--config-dir", str(tmp_path), "--config-name", "mine")
+        arguments = ("--config-dir", str(tmp_path), "--config-name", "of_ones_own")
         settings = compose("train_offline", *arguments, "training.seed=5")
         assert (settings.agent, settings.training) == (AGENTS["focus"], Training(updates=3, seed=5))
-        (tmp_path / "mine.yaml").write_text("defaults: [train_offline, _self_]\ntraining: {update: 3}\n")
+        (tmp_path / "of_ones_own.yaml").write_text("defaults: [train_offline, _self_]\ntraining: {update: 3}\n")
         said = compose("train_offline", *arguments)
         assert said.startswith("SettingsError: training.update is no setting; there are updates, seed")
 

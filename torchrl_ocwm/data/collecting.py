@@ -252,10 +252,9 @@ def with_coverage(dataset: EpisodeDataset, task: Task) -> EpisodeDataset:
 
 
 def _open_if_there(path: Path, source: dict[str, Any]) -> EpisodeDataset | None:
-    """The dataset in a folder to which can be written; ``None`` if there is none yet."""
+    """The dataset in a folder that can be written to; ``None`` if there is none yet, and the folder can be made."""
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        TemporaryFile(dir=path).close()
+        TemporaryFile(dir=next(one for one in (path, *path.parents) if one.exists())).close()
     except OSError as error:
         raise DatasetError(f"{path}: cannot write a dataset here ({error.strerror or error})") from error
     if not (path / "dataset.json").exists():
