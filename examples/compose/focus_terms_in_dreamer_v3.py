@@ -125,6 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--batch", type=int, default=8, help="sequences")
     parser.add_argument("--length", type=int, default=16, help="records of each")
     parser.add_argument("--width", type=int, default=128, help="of all layers")
+    parser.add_argument("--warmup", type=int, default=100, help="updates until the learning rate is whole")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("outputs/focus_terms_in_dreamer_v3"))
@@ -137,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     loss = make_dreamer(dataset.task, given.width).to(given.device)
     stepper = DreamerV3OptimizationStepper(
         loss,
-        DreamerV3Optimizer(loss.parameters(), lr=1e-3, warmup_steps=100),
+        DreamerV3Optimizer(loss.parameters(), lr=1e-3, warmup_steps=given.warmup),
         SoftUpdate(loss.value_loss, tau=0.02),
         compile_train_step=False,
         cudagraph=False,
