@@ -19,9 +19,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.modules import CEMPlanner
+from tqdm import tqdm
 
 from torchrl_ocwm.agents import Policy, load_agent
-from torchrl_ocwm.evaluation import EvaluationEnvs, Report, measure
+from torchrl_ocwm.evaluation import EvaluationEnvs, Report, goal_images, measure
 
 
 class LatentPlanner(CEMPlanner):
@@ -36,8 +37,9 @@ def plan_instead(policy: Policy, planner: TensorDictModuleBase) -> TensorDictSeq
     return TensorDictSequential(*(planner if part is policy.behaviour.actor else part for part in policy.module))
 
 
-def on_device(policy: TensorDictModuleBase, device: str, step: TensorDictBase) -> TensorDictBase:
+def act(policy: TensorDictModuleBase, device: str, progress: tqdm, step: TensorDictBase) -> TensorDictBase:
     """Act on a device; the environments are on the CPU."""
+    progress.update()
     return policy(step.to(device)).to("cpu")
 
 
@@ -64,11 +66,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     task, about = policy.agent.task, policy.object_index
     goals = task.workspace.grid(given.grid).flatten(0, -2)
+    images = None if policy.takes_positions else goal_images(task, goals, object_index=about)
     options = {name: value for name, value in vars(given).items() if name not in ("checkpoint", "device", "output")}
     report = Report(goals, options)
-    with EvaluationEnvs(task, episode_steps=given.steps, workers=0, envs=given.grid) as envs:
+    at_once = min(len(goals), 10)
+    steps = given.steps * -(-len(goals) // at_once)
+    with EvaluationEnvs(task, episode_steps=given.steps, workers=0, envs=at_once) as envs:
         for name, acting in {"policy": policy, "planner": plan_instead(policy, planner)}.items():
-            episodes = envs.run(partial(on_device, acting, given.device), goals, seed=given.seed, progress=True)
+            with tqdm(desc=name, total=steps, unit="step") as progress:
+                acted = partial(act, acting, given.device, progress)
+                episodes = envs.run(acted, goals, images=images, seed=given.seed)
             report.add(name, measure(episodes, object_index=about), source=str(given.checkpoint))
     report.save(given.output)
     print(report.markdown())

@@ -77,8 +77,11 @@ def test_focus_terms_are_learnt_by_torchrls_dreamer(tmp_path: Path) -> None:
     assert all("prior_projector" in name for name in still)  # the KL is below the free nats
 
 
-def test_a_planner_takes_the_place_of_the_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    checkpoint = save_agent(build_agent("focus_lcp", reacher_task(), size="debug"), tmp_path / "agent.zip")
+@pytest.mark.parametrize("agent", ["focus_lcp", "dreamer", "lexa_cosine"])  # goals: positions, none, images only
+def test_a_planner_takes_the_place_of_the_policy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], agent: str
+) -> None:
+    checkpoint = save_agent(build_agent(agent, reacher_task(), size="debug"), tmp_path / "agent.zip")
     tiny = ("--grid=2", "--steps=3", "--horizon=2", "--candidates=4", "--iterations=1")
     load("plan_in_imagination").main([str(checkpoint), *tiny, f"--output={tmp_path}"])
     distances = per_goal(tmp_path)
@@ -97,6 +100,14 @@ def test_the_planner_goes_towards_the_goal() -> None:
     step = TensorDict(
         {"latent": TensorDict({"state": zero, "belief": zero, "goal": goal}, [2]), "pixels": torch.zeros(2, 3)}, [2]
     )
+    rollout, copied = env.rollout, set()
+
+    def watched(**arguments: Any) -> TensorDictBase:
+        copied.update(arguments["tensordict"].keys())
+        return rollout(**arguments)
+
+    env.rollout = watched  # type: ignore[method-assign]
     action = planner(step)["action"]
+    assert copied == {"latent"}
     assert action[0] > 0.5
     assert action[1] < -0.5
