@@ -16,8 +16,12 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from tensordict.nn import ProbabilisticTensorDictModule as Sample
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 from tensordict.nn import TensorDictModule as Mod
 from tensordict.utils import NestedKey
 from torch import nn
@@ -63,59 +67,71 @@ def see_objects(task: Task, features: int, width: int) -> list[TensorDictModuleB
     extractor = ObjectLatentExtractor(features, instances=objects + 1, features=width, units=width)
     decoder = ObjectDecoder(width, task.image_size, Architecture(cnn_depth=max(width // 16, 1)))
     position = DreamerV3MLP(width, units.dim, depth=2, num_cells=width)
-    latent, things = ("next", "object_latent"), ("next", "thing_latent")
+    latent, objects_only = ("next", "object_latent"), ("next", "object_latent_without_background")
     return [
         Mod(nn.Sequential(units, nn.Flatten(-2)), [("next", "object_position")], [("next", "object_units")]),
         Mod(extractor, NEXT, [latent]),
         Mod(decoder, [latent], [("next", "reco_object_pixels"), ("next", "mask_logits")]),
-        Mod(lambda all_latents: all_latents[..., :-1, :], [latent], [things]),  # the background has no position
-        Mod(nn.Sequential(position, nn.Flatten(-2)), [things], [("next", "reco_object_units")]),
+        Mod(lambda latents: latents[..., :-1, :], [latent], [objects_only]),
+        Mod(nn.Sequential(position, nn.Flatten(-2)), [objects_only], [("next", "reco_object_units")]),
     ]
+
+
+def see_frame(task: Task, width: int) -> tuple[list[TensorDictModuleBase], int]:
+    """Image and goal as one vector, and its features."""
+    units = WorkspaceUnits(task.workspace.low, task.workspace.high)
+    image = DreamerV3ImageEncoder(3, max(width // 16, 1), (1, 2, 4, 8))
+    seen, goal = ("next", "seen"), ("next", "goal_units")
+    modules = [
+        Mod(image, [("next", "pixels")], [seen]),
+        Mod(units, [("next", "goal_position")], [goal]),
+        Mod(lambda *vectors: torch.cat(vectors, -1), [seen, goal], [("next", "encoded_latents")]),
+    ]
+    return modules, image.output_features((3, task.image_size, task.image_size)) + units.dim
+
+
+def make_imagination(model: WorldModelWrapper, state: int, belief: int, action: int) -> DreamerEnv:
+    """TorchRL's environment of a world model."""
+    env = DreamerEnv(model, prior_shape=(state,), belief_shape=(belief,))
+    env.observation_spec = Composite(state=Unbounded(state), belief=Unbounded(belief))
+    env.state_spec = env.observation_spec.clone()
+    env.action_spec, env.reward_spec = Bounded(-1, 1, (action,)), Unbounded((1,))
+    return env
 
 
 def make_dreamer(task: Task, width: int) -> Dreamer:
     """TorchRL's DreamerV3, but for ``see_objects`` and ``FOCUSModelLoss``."""
     state, belief, action = 16 * 16, width, task.action
-    mlp = partial(DreamerV3MLP, state + belief, depth=2, num_cells=width)
-    image = DreamerV3ImageEncoder(3, max(width // 16, 1), (1, 2, 4, 8))
-    embedded = image.output_features((3, task.image_size, task.image_size))
+    frame, embedded = see_frame(task, width)
     rssm = {"hidden_dim": width, "rnn_hidden_dim": belief, "num_categoricals": 16, "num_classes": 16, "unimix": 0.01}
     prior = RSSMPriorV3(action_shape=(action,), action_dim=action, **rssm)
-    posterior = RSSMPosteriorV3(obs_embed_dim=embedded + task.workspace.dim, **rssm)
-    reward, goes_on, two_hot = mlp(255, outscale=0.0), mlp(1), SymExpTwoHot()
-    world_model = TensorDictSequential(
-        InitialLatent(state, belief),
-        Mod(image, [("next", "pixels")], [("next", "seen")]),
-        Mod(
-            lambda *parts: torch.cat(parts, -1),
-            [("next", "seen"), ("next", "goal_position")],
-            [("next", "encoded_latents")],
-        ),
-        RSSMRolloutV3(
-            Mod(prior, [*LATENT, "action"], [("next", "prior_logits"), *NEXT]),
-            Mod(posterior, [NEXT[1], ("next", "encoded_latents")], [("next", "posterior_logits"), NEXT[0]]),
-        ),
-        Mod(reward, NEXT, [("next", "reward_logits")]),
-        Mod(goes_on, NEXT, [("next", "continue_pred")]),
-        *see_objects(task, state + belief, width),
+    posterior = RSSMPosteriorV3(obs_embed_dim=embedded, **rssm)
+    rollout = RSSMRolloutV3(
+        Mod(prior, [*LATENT, "action"], [("next", "prior_logits"), *NEXT]),
+        Mod(posterior, [NEXT[1], ("next", "encoded_latents")], [("next", "posterior_logits"), NEXT[0]]),
     )
-    transition = Mod(prior, [*LATENT, "action"], ["_", *LATENT])
-    judge = TensorDictSequential(Mod(reward, LATENT, ["logits"]), Mod(two_hot, ["logits"], ["reward"]))
-    imagination = DreamerEnv(WorldModelWrapper(transition, judge), prior_shape=(state,), belief_shape=(belief,))
-    imagination.observation_spec = Composite(state=Unbounded(state), belief=Unbounded(belief))
-    imagination.state_spec = imagination.observation_spec.clone()
-    imagination.action_spec, imagination.reward_spec = Bounded(-1, 1, (action,)), Unbounded((1,))
+    mlp, two_hot = partial(DreamerV3MLP, state + belief, 255, depth=2, num_cells=width, outscale=0.0), SymExpTwoHot()
+    reward = mlp()
+    model_loss = FOCUSModelLoss(
+        TensorDictSequential(
+            *[InitialLatent(state, belief), *frame, rollout, Mod(reward, NEXT, [("next", "reward_logits")])],
+            *see_objects(task, state + belief, width),
+        ),
+        lambda_object_position=200.0,
+    )
+    imagined_reward = TensorDictSequential(Mod(reward, LATENT, ["logits"]), Mod(two_hot, ["logits"], ["reward"]))
+    model = WorldModelWrapper(Mod(prior, [*LATENT, "action"], ["_", *LATENT]), imagined_reward)
     actor = ProbabilisticTensorDictSequential(
         Mod(Actor(state + belief, action, layers=2, units=width), LATENT, ["loc", "scale"]),
-        Sample(["loc", "scale"], ["action"], distribution_class=IndependentNormal),
+        ProbabilisticTensorDictModule(["loc", "scale"], ["action"], distribution_class=IndependentNormal),
     )
     critic = TensorDictSequential(
-        Mod(mlp(255, outscale=0.0), LATENT, ["state_value_logits"]),
-        Mod(two_hot, ["state_value_logits"], ["state_value"]),
+        Mod(mlp(), LATENT, ["state_value_logits"]), Mod(two_hot, ["state_value_logits"], ["state_value"])
     )
+    imagination = make_imagination(model, state, belief, action)
     actor_loss = DreamerV3ActorLoss(actor, critic, imagination, imagination_horizon=10)
     value_loss = DreamerV3ValueLoss(critic, value_loss="two_hot", actor_loss=actor_loss, slow_critic_regularization=1.0)
-    return Dreamer(FOCUSModelLoss(world_model, lambda_object_position=200.0), actor_loss, value_loss)
+    return Dreamer(model_loss, actor_loss, value_loss)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
