@@ -22,7 +22,7 @@ from tensordict.nn import (
     TensorDictModule,
     TensorDictSequential,
 )
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.data import HERReplayBuffer, LazyTensorStorage
 from torchrl.envs import EnvBase, FlattenObservation, SelectTransform
@@ -31,8 +31,9 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from torchrl.record import CSVLogger
 from tqdm import tqdm
 
-from torchrl_ocwm.envs import make_env, make_task
+from torchrl_ocwm.envs import Workspace, make_env, make_task
 from torchrl_ocwm.evaluation import EvaluationEnvs, Report, measure
+from torchrl_ocwm.modules import WorkspaceUnits
 
 SEEN = ["proprio", "position", "goal_position"]
 
@@ -50,21 +51,30 @@ def reward(transition: TensorDictBase) -> Tensor:
     return -torch.linalg.vector_norm(transition["next", "position"] - transition["goal_position"], dim=-1, keepdim=True)
 
 
-def make_loss(env: EnvBase, width: int, gamma: float) -> SACLoss:
-    """Actor and two critics, which see all vectors at once."""
-    spec = env.action_spec_unbatched
-    cells = [width, width]
+class Network(nn.Module):
+    """An MLP that sees joints, position and goal, the last two in workspace units, and in a critic the action."""
+
+    def __init__(self, units: WorkspaceUnits, out_features: int, width: int) -> None:
+        super().__init__()
+        self.units, self.mlp = units, MLP(out_features=out_features, num_cells=[width, width])
+
+    def forward(self, proprio: Tensor, position: Tensor, goal: Tensor, *action: Tensor) -> Tensor:
+        return self.mlp(proprio, self.units(position), self.units(goal), *action)
+
+
+def make_loss(env: EnvBase, workspace: Workspace, width: int, gamma: float) -> SACLoss:
+    """Actor and two critics."""
+    spec, units = env.action_spec_unbatched, WorkspaceUnits(workspace.low, workspace.high)
     actor = ProbabilisticTensorDictSequential(
-        TensorDictModule(MLP(out_features=2 * spec.shape[-1], num_cells=cells), SEEN, ["parameters"]),
+        TensorDictModule(Network(units, 2 * spec.shape[-1], width), SEEN, ["parameters"]),
         TensorDictModule(NormalParamExtractor(), ["parameters"], ["loc", "scale"]),
         ProbabilisticTensorDictModule(
             ["loc", "scale"], ["action"], distribution_class=TanhNormal, return_log_prob=True
         ),
     )
-    critic = ValueOperator(MLP(out_features=1, num_cells=cells), in_keys=[*SEEN, "action"])
-    seen = env.fake_tensordict()
-    critic(actor(seen))  # the first call makes the first layers
-    loss = SACLoss(actor, critic, action_spec=spec, alpha_init=0.1)
+    critic = ValueOperator(Network(units, 1, width), in_keys=[*SEEN, "action"])
+    critic(actor(env.fake_tensordict()))  # the first call makes the first layers
+    loss = SACLoss(actor, critic, action_spec=spec, alpha_init=0.01)  # rewards are tenths of metres
     loss.make_value_estimator(gamma=gamma)
     return loss
 
@@ -86,8 +96,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     torch.manual_seed(given.seed)
     env, task = make_vector_env(given.episode, given.seed), make_task("reacher")
-    loss = make_loss(env, given.width, given.gamma)
-    optimizer, slow = torch.optim.Adam(loss.parameters(), lr=3e-4), SoftUpdate(loss, tau=0.005)
+    loss = make_loss(env, task.workspace, given.width, given.gamma)
+    optimizer, slow = torch.optim.Adam(loss.parameters(), lr=1e-3), SoftUpdate(loss, tau=0.005)
     buffer = HERReplayBuffer(
         reward,
         her_ratio=given.hindsight,
