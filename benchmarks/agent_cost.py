@@ -50,11 +50,9 @@ from torchrl.modules import RSSMRolloutV3
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
-from torchrl_ocwm.envs import Task
-from torchrl_ocwm.envs.workspace import Workspace
+from torchrl_ocwm.envs import Task, Workspace
 from torchrl_ocwm.testing import random_records
-from torchrl_ocwm.training.settings import Training
-from torchrl_ocwm.training.stepper import make_stepper
+from torchrl_ocwm.training import Training, make_stepper
 
 T = TypeVar("T")
 

@@ -14,9 +14,8 @@ from contextlib import closing
 import gymnasium
 import numpy as np
 
-from torchrl_ocwm.envs import ENVIRONMENTS
+from torchrl_ocwm.envs import ENVIRONMENTS, PositioningEnv
 from torchrl_ocwm.envs.opengl import context_class
-from torchrl_ocwm.envs.positioning import PositioningEnv
 
 PARTS = 5
 TIMES = 10

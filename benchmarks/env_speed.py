@@ -23,8 +23,7 @@ import numpy as np
 import torch
 from torchrl.collectors import MultiSyncCollector
 
-from torchrl_ocwm.envs import ENVIRONMENTS, make_env
-from torchrl_ocwm.envs.positioning import PositioningEnv
+from torchrl_ocwm.envs import ENVIRONMENTS, PositioningEnv, make_env
 
 
 def make_one(name: str, image_size: int) -> PositioningEnv:

@@ -16,8 +16,7 @@ import time
 import gymnasium
 import numpy as np
 
-from torchrl_ocwm.envs import ENVIRONMENTS
-from torchrl_ocwm.envs.positioning import PositioningEnv
+from torchrl_ocwm.envs import ENVIRONMENTS, PositioningEnv
 
 STEPS = 60
 

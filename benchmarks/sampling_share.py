@@ -23,8 +23,7 @@ from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
 from torchrl_ocwm.data import EpisodeDataset, RelabelGoals, make_replay_buffer
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.testing import random_dataset, reacher_task
-from torchrl_ocwm.training.settings import Training
-from torchrl_ocwm.training.stepper import make_stepper
+from torchrl_ocwm.training import Training, make_stepper
 
 EPISODES, LENGTH = 40, 501
 

@@ -12,7 +12,7 @@ dispatch mode of our own: ``FlopCounterMode`` cannot walk the parameters of a lo
 reach PyTorch's dispatcher in an eager update.
 
 ``--before`` measures another commit too, in a worktree of git and in turns with this one, and says how much faster
-this one is, in times. It needs the settings of today, so that 45c8d50 is the earliest.
+this one is, in times. The earliest is a60843d, whose names it uses.
 """
 
 from __future__ import annotations
@@ -36,8 +36,7 @@ from torch.utils.flop_counter import flop_registry
 
 from torchrl_ocwm.agents import AGENTS, SIZES, build_agent
 from torchrl_ocwm.testing import random_records, reacher_task
-from torchrl_ocwm.training.settings import Training
-from torchrl_ocwm.training.stepper import make_stepper
+from torchrl_ocwm.training import Training, make_stepper
 
 ROOT = Path(__file__).parents[1]
 HEAD = ["agent", "GFLOP", "operations", "s/update", "product, GFLOP/s", "efficiency"]
@@ -169,7 +168,7 @@ def row(agent: str, children: Sequence[Child], rounds: int) -> list[str]:
     update = statistics.median(turn[0][0] for turn in times)
     rate = statistics.median(2 * SIDE**3 / turn[0][1] for turn in times)
     efficiency = statistics.median(first.flop * turn[0][1] / (turn[0][0] * 2 * SIDE**3) for turn in times)
-    cells = [agent, f"{first.flop / 1e9:.1f}", f"{first.operations:,}", f"{update:.3g}", f"{rate / 1e9:.1f}"]
+    cells = [agent, f"{first.flop / 1e9:.3g}", f"{first.operations:,}", f"{update:.3g}", f"{rate / 1e9:.1f}"]
     cells.append(f"{efficiency:.2f}")
     for other, child in enumerate(others, 1):
         cells += [f"{child.operations:,}", f"{statistics.median(turn[other][0] / turn[0][0] for turn in times):.2f}"]

@@ -11,8 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torchrl_ocwm.agents import collecting_policy
-from torchrl_ocwm.data.collect import collect
-from torchrl_ocwm.data.settings import Collection
+from torchrl_ocwm.data import Collection, collect
 from torchrl_ocwm.envs import EnvChoice
 from torchrl_ocwm.recipes import recipe
 from torchrl_ocwm.signals import ended_by_signals

@@ -17,13 +17,19 @@ from torchrl_ocwm import load_agent
 from torchrl_ocwm.agents import Agent
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.envs import Task
-from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
-from torchrl_ocwm.evaluation.object_pictures import draw_errors, draw_goal_latents, picture_objects
-from torchrl_ocwm.evaluation.objects import object_errors
-from torchrl_ocwm.evaluation.open_loop import random_sequences
-from torchrl_ocwm.evaluation.output import writing
-from torchrl_ocwm.evaluation.report import to_json
-from torchrl_ocwm.evaluation.settings import Diagnosis
+from torchrl_ocwm.evaluation import (
+    Diagnosis,
+    check_ffmpeg,
+    draw_errors,
+    draw_goal_latents,
+    latent_pairs,
+    match,
+    object_errors,
+    picture_objects,
+    random_sequences,
+    to_json,
+    writing,
+)
 from torchrl_ocwm.modules import ObjectWorldModel
 from torchrl_ocwm.recipes import recipe
 from torchrl_ocwm.settings import to_dict
@@ -59,6 +65,8 @@ class Diagnose(Diagnosis):
 @ended_by_signals()
 def main(config: Diagnose) -> None:
     settings, output = config, Path(config.output)
+    if settings.video_sequences:
+        check_ffmpeg("video_sequences")
     agent = load_agent(config.checkpoint, device=settings.device).agent
     records = _records(Path(config.dataset), config.checkpoint, agent.task, settings)
     torch.manual_seed(settings.seed)

@@ -19,31 +19,36 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm import load_agent
-from torchrl_ocwm.agents import Agent, Policy, agent_name
-from torchrl_ocwm.agents.checkpoint import describe
+from torchrl_ocwm.agents import Agent, Policy, agent_name, describe
 from torchrl_ocwm.data import SmoothRandomPolicy
 from torchrl_ocwm.envs import Task, find_environment, make_scene
 from torchrl_ocwm.evaluation import (
+    Evaluation,
     EvaluationEnvs,
     ReconstructionError,
     Report,
+    check_ffmpeg,
+    decode_video,
+    draw_errors,
     episode_records,
     goal_images,
+    heatmap,
     imagined_distance,
     imagined_rollout,
+    learning_curves,
+    mark,
     measure,
+    object_errors,
+    picture_objects,
+    tile,
     transition,
+    write_video,
 )
-from torchrl_ocwm.evaluation.object_pictures import draw_errors, picture_objects
-from torchrl_ocwm.evaluation.objects import object_errors
-from torchrl_ocwm.evaluation.plots import heatmap, learning_curves
-from torchrl_ocwm.evaluation.settings import Evaluation
-from torchrl_ocwm.evaluation.videos import decode_video, mark, tile, write_video
 from torchrl_ocwm.modules import ObjectWorldModel
 from torchrl_ocwm.recipes import recipe
 from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.signals import ended_by_signals
-from torchrl_ocwm.training.offline import CHECKPOINT
+from torchrl_ocwm.training import CHECKPOINT
 
 CONTEXT = 5  # frames that are seen before the objects are imagined
 IMAGE_GOALS = ", image goals"  # after the name of a row; without it goals are positions
@@ -81,6 +86,8 @@ class Evaluate(Evaluation):
 @ended_by_signals()
 def main(config: Evaluate) -> None:
     settings = config
+    if settings.video_goals:
+        check_ffmpeg("video_goals")
     files = [Path(one) for one in ([config.checkpoint] if isinstance(config.checkpoint, str) else config.checkpoint)]
     policies = [load_agent(file, behaviour=settings.behaviour) for file in files]
     task, about, output = _one_task(policies, files), policies[0].object_index, Path(config.output)

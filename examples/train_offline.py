@@ -16,14 +16,11 @@ import torch
 from torchrl_ocwm.agents import AgentConfig, Size, build_agent
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.devices import usable_device
-from torchrl_ocwm.envs.registry import EnvChoice
-from torchrl_ocwm.evaluation import LandmarkEvaluation
-from torchrl_ocwm.evaluation.videos import OpenLoopFilm
+from torchrl_ocwm.envs import EnvChoice
+from torchrl_ocwm.evaluation import LandmarkEvaluation, OpenLoopFilm
 from torchrl_ocwm.recipes import keep_settings, recipe, run_folder
 from torchrl_ocwm.settings import Settings
-from torchrl_ocwm.training.memory import check_memory
-from torchrl_ocwm.training.offline import train_offline
-from torchrl_ocwm.training.settings import Training
+from torchrl_ocwm.training import Training, check_memory, train_offline
 
 
 @dataclass(frozen=True)

@@ -15,18 +15,14 @@ from pathlib import Path
 import torch
 
 from torchrl_ocwm.agents import AgentConfig, Size, build_agent
-from torchrl_ocwm.data.collect import with_coverage
+from torchrl_ocwm.data import with_coverage
 from torchrl_ocwm.devices import usable_device
-from torchrl_ocwm.envs import make_task
-from torchrl_ocwm.envs.registry import EnvChoice
-from torchrl_ocwm.evaluation import LandmarkEvaluation
-from torchrl_ocwm.evaluation.videos import OpenLoopFilm, check_ffmpeg
+from torchrl_ocwm.envs import EnvChoice, make_task
+from torchrl_ocwm.evaluation import LandmarkEvaluation, OpenLoopFilm, check_ffmpeg
 from torchrl_ocwm.recipes import keep_settings, recipe, run_folder
 from torchrl_ocwm.settings import Settings
 from torchrl_ocwm.signals import ended_by_signals
-from torchrl_ocwm.training.memory import check_memory
-from torchrl_ocwm.training.online import collect_seed_steps, train_online
-from torchrl_ocwm.training.settings import Online, Training
+from torchrl_ocwm.training import Online, Training, check_memory, collect_seed_steps, train_online
 
 
 @dataclass(frozen=True)
@@ -70,7 +66,7 @@ def main(config: TrainOnline) -> None:
                 LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps)
             )
         if training.video_interval:
-            check_ffmpeg()
+            check_ffmpeg("training.video_interval")
         path = Path(config.dataset or folder / "data")
         with ended_by_signals():
             dataset = collect_seed_steps(path, name, config.online, seed=training.seed, options=options)

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+import ast
 import importlib.metadata
 import importlib.util
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -16,6 +20,12 @@ from torchrl_ocwm.envs import ENVIRONMENTS
 from torchrl_ocwm.envs.missing import missing, needs
 
 OURS = tuple(ENVIRONMENTS)  # the documentation adds one of its own
+ROOT = Path(torchrl_ocwm.__file__).parents[1]
+ROOMS = sorted(file.parent.name for file in Path(torchrl_ocwm.__file__).parent.glob("*/__init__.py"))
+#: Imported for what importing it does: it fills TorchRL's store of configurations.
+FOR_ITS_EFFECT = "torchrl_ocwm.recipes.torchrl_configs"
+SHOWN = [ROOT / "README.md", *sorted(file for room in ("examples", "docs") for file in (ROOT / room).rglob("*.*"))]
+SHOWN = [file for file in SHOWN if file.suffix in (".py", ".md")]
 
 
 def requirements(name: str, seen: set[str]) -> set[str]:
@@ -74,6 +84,53 @@ def test_an_agent_learns_with_torch_tensordict_and_torchrl_alone(bare: Path) -> 
     assert "tensor(True)" in run(bare, code).stdout
 
 
+def test_what_needs_a_package_of_an_extra_names_it_when_it_is_called(bare: Path) -> None:
+    done = run(bare, "from torchrl_ocwm.data import collect; collect('data', 'reacher', 10)")
+    assert "pip install 'torchrl-ocwm[recipes]'" in done.stderr.splitlines()[-1]
+
+
+def test_an_evaluation_that_draws_and_films_nothing_loads_no_packages_for_that() -> None:
+    blocked = "import sys; sys.modules.update(dict.fromkeys(('matplotlib', 'imageio', 'imageio_ffmpeg')))"
+    code = f"{blocked}; import torchrl_ocwm.evaluation, torchrl_ocwm.training"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def python(file: Path) -> list[str]:
+    """The Python in a script, or in the blocks of a page."""
+    text = file.read_text()
+    return [text] if file.suffix == ".py" else re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def ours(code: str) -> Iterator[tuple[str, list[str]]]:
+    """What code imports of this package: modules, with the names taken from each."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.ImportFrom):
+            yield str(node.module), [one.name for one in node.names]
+        elif isinstance(node, ast.Import):
+            yield from ((one.name, []) for one in node.names if one.name != FOR_ITS_EFFECT)
+
+
+@pytest.mark.parametrize("file", SHOWN, ids=lambda file: str(file.relative_to(ROOT)))
+def test_users_are_shown_imports_from_rooms_not_from_their_modules(file: Path) -> None:
+    for module, names in (found for code in python(file) for found in ours(code)):
+        package, *inside = module.split(".")
+        if package != "torchrl_ocwm":
+            continue
+        assert len(inside) < 2, f"{module} is a module in a room; export {names} in the room's __init__"
+        if not inside or inside[0] in ROOMS:
+            exported = import_module(module).__all__
+            assert set(names) <= set(exported), f"{module} does not export {sorted(set(names) - set(exported))}"
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_what_a_room_exports_is_there(room: str) -> None:
+    module = import_module(f"torchrl_ocwm.{room}")
+    assert module.__all__
+    for name in module.__all__:
+        assert not isinstance(getattr(module, name), ModuleType), f"{name} is the module of the same name"
+
+
 def test_a_missing_simulator_is_named(bare: Path) -> None:
     done = run(bare, "from torchrl_ocwm import make_env; make_env('reacher')")
     assert "pip install 'torchrl-ocwm[dm-control]'" in done.stderr.splitlines()[-1]
@@ -99,9 +156,8 @@ def test_check_finds_the_renderer() -> None:
 
 def run_make(folder: Path, version: str) -> subprocess.CompletedProcess[str]:
     """``make check`` where the interpreter says that it has some version."""
-    root = Path(torchrl_ocwm.__file__).parents[1]
     for name in ("Makefile", "pyproject.toml", "constraints.txt"):
-        (folder / name).write_text((root / name).read_text())
+        (folder / name).write_text((ROOT / name).read_text())
     interpreter = folder / "python"
     interpreter.write_text(
         f'#!/bin/sh\ncase "$*" in *venv*) echo "makes an environment"; exit 3;; esac\necho {version}\n'

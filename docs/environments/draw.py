@@ -9,8 +9,7 @@ import gymnasium
 import matplotlib.pyplot as plt
 import numpy as np
 
-from torchrl_ocwm.envs import ENVIRONMENTS
-from torchrl_ocwm.envs.positioning import PositioningEnv
+from torchrl_ocwm.envs import ENVIRONMENTS, PositioningEnv
 
 SIZE = 480  # pixels
 AXIS = 0.3  # of the workspace's larger side

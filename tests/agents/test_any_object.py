@@ -15,9 +15,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_ocwm.agents import AGENTS, Agent, Behaviour, build_agent
-from torchrl_ocwm.data import EpisodeDataset
-from torchrl_ocwm.data.collect import collect
-from torchrl_ocwm.data.settings import Collection
+from torchrl_ocwm.data import Collection, EpisodeDataset, collect
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.evaluation import LandmarkEvaluation, goal_images, measure, normalized_score
 from torchrl_ocwm.modules import UnitRMS

@@ -17,9 +17,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from torchrl_ocwm.agents import build_agent
-from torchrl_ocwm.data import SmoothRandomPolicy
-from torchrl_ocwm.data.collect import collect
-from torchrl_ocwm.data.settings import Collection
+from torchrl_ocwm.data import Collection, SmoothRandomPolicy, collect
 from torchrl_ocwm.envs import Task, make_task
 from torchrl_ocwm.evaluation import (
     EvaluationEnvs,

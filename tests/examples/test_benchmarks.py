@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import sys
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -15,9 +16,8 @@ import torch
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
-@pytest.fixture(scope="module")
-def agent_cost() -> ModuleType:
-    specification = importlib.util.spec_from_file_location("agent_cost", BENCHMARKS / "agent_cost.py")
+def benchmark(name: str) -> ModuleType:
+    specification = importlib.util.spec_from_file_location(name, BENCHMARKS / f"{name}.py")
     assert specification
     assert specification.loader
     module = importlib.util.module_from_spec(specification)
@@ -25,21 +25,35 @@ def agent_cost() -> ModuleType:
     return module
 
 
+@pytest.fixture(scope="module")
+def agent_cost() -> ModuleType:
+    return benchmark("agent_cost")
+
+
+@pytest.fixture(scope="module")
+def update_speed() -> ModuleType:
+    return benchmark("update_speed")
+
+
+def cells(printed: str) -> list[list[str]]:
+    """Those of a table."""
+    lines = [line for line in printed.splitlines() if "|" in line]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
 def test_cost_of_agents_is_a_table_with_shares_that_add_up() -> None:
     agents = ["dreamer", "focus_lcp"]
-    command = ["--agents", *agents, "--sizes", "debug", "--rounds", "1", "--threads", "1"]
-    done = subprocess.run(
-        [sys.executable, str(BENCHMARKS / "agent_cost.py"), *command], capture_output=True, text=True, check=False
-    )
+    options = ["--agents", *agents, "--sizes", "debug", "--rounds", "1", "--threads", "1"]
+    command = [sys.executable, str(BENCHMARKS / "agent_cost.py"), *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert f"torch {torch.__version__}, cpu, float32, 1 threads" in done.stdout
-    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in done.stdout.splitlines() if "|" in line]
-    head, _, *rows = lines
+    head, _, *rows = cells(done.stdout)
     assert [row[0] for row in rows] == agents
     for row in rows:
-        cells = dict(zip(head, row, strict=True))
-        assert min(float(cells[name]) for name in ("s/update", "x reference", "peak MiB")) > 0
-        shares = [float(cells[name]) for name in head[-6:]]
+        named = dict(zip(head, row, strict=True))
+        assert min(float(named[name]) for name in ("s/update", "x reference", "peak MiB")) > 0
+        shares = [float(named[name]) for name in head[-6:]]
         assert all(0 <= share <= 1 for share in shares)
         assert sum(shares) == pytest.approx(1, abs=0.031)  # six rounded numbers
 
@@ -61,3 +75,36 @@ def test_update_cut_into_parts_is_the_update(agent_cost: ModuleType, name: str, 
     assert whole.keys() == parts.keys()
     for key, value in whole.items():
         torch.testing.assert_close(parts[key], value, msg=key)
+
+
+def test_work_is_that_of_products_and_convolutions_in_both_passes(update_speed: ModuleType) -> None:
+    left, right = torch.rand(3, 5, requires_grad=True), torch.rand(5, 7, requires_grad=True)
+    images, kernels = torch.rand(2, 3, 8, 8), torch.rand(4, 3, 5, 5, requires_grad=True)
+    with update_speed.Work() as product:
+        (left @ right).sum().backward()
+    with update_speed.Work() as convolution:
+        torch.nn.functional.conv2d(images, kernels, stride=2, padding=2).sum().backward()
+    assert product.flop == 3 * 2 * 3 * 5 * 7  # forward, and the gradients of both
+    assert convolution.flop == 2 * 2 * (2 * 4 * 4 * 4) * (3 * 5 * 5)  # forward, and the gradient of the kernels
+    with update_speed.Work() as none:
+        _ = left + left.detach()
+    assert (none.flop, none.operations) == (0, 2)
+
+
+def test_speed_of_updates_beside_another_commit(
+    update_speed: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The other commit is this one again."""
+    options = ["--agents", "dreamer", "--sizes", "debug", "--rounds", "2", "--updates", "1", "--before", "this"]
+    monkeypatch.setattr(sys, "argv", ["update_speed.py", *options])
+    monkeypatch.setattr(update_speed, "checkout", lambda commit: nullcontext(BENCHMARKS.parent))
+    update_speed.main()
+    printed = capsys.readouterr().out
+    assert "cpu, float32, 1 threads; medians of 2 rounds of 1 updates" in printed
+    head, _, row = cells(printed)
+    assert head == [*update_speed.HEAD, "operations before", "times faster"]
+    agent, gflop, operations, seconds, rate, efficiency, before, ratio = row
+    assert agent == "dreamer"
+    assert operations == before
+    assert min(float(cell) for cell in (gflop, seconds, rate, ratio)) > 0
+    assert 0 <= float(efficiency) < 1

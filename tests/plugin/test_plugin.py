@@ -17,9 +17,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl_ocwm import build_agent, load_agent, make_env, make_task
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, Behaviour, collecting_policy, save_agent
 from torchrl_ocwm.agents.checkpoint import describe, read_parts
-from torchrl_ocwm.data import EpisodeDataset
-from torchrl_ocwm.data.collect import collect
-from torchrl_ocwm.data.settings import Collection
+from torchrl_ocwm.data import Collection, EpisodeDataset, collect
 from torchrl_ocwm.envs import EnvChoice, find_environment
 from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.evaluation import EvaluationEnvs

@@ -28,6 +28,7 @@ REFUSED = """
 collect dataset=null                               dataset must be a text, got None
 collect dataset=[a,b]                              dataset must be a text, got ['a', 'b']
 collect dataset=???                                dataset is missing
+collect env=null                                   env must be one of
 collect env.name=foo                               env.name must be one of reacher, cube_move, shelf_place, pick_place,
 collect env.name=null                              env.name must be a text, got None
 collect env.options=null                           env.options must be a mapping of names, got None
@@ -96,6 +97,10 @@ evaluate seed=null                                 seed must be a whole number, 
 evaluate video_goals=-1                            video_goals must be at least 0, got -1
 evaluate workers=-1                                workers must be at least 0, got -1
 evaluate workers=abc                               workers must be a whole number, got 'abc'
+train_offline agent=null                           agent must be one of
+train_offline agent=NULL                           agent must be one of
+train_offline explore=null                         explore must be one of
+train_offline size=null                            size must be one of
 train_offline agent.lambda_proprio=null            agent.lambda_proprio is no setting; there are world_model, behaviours
 train_offline size.batch_size=100000000            size.batch_size is no setting; there are architecture, learning
 train_offline size.cnn_mults=3                     size.cnn_mults is no setting; there are architecture, learning
@@ -242,6 +247,14 @@ class TestGroups:
         said = compose("collect", "+env.options.objects=[cube,distractor]")  # of Reacher
         assert said.startswith("SettingsError: env.options.objects is no setting")
 
+    def test_a_group_without_a_choice(self) -> None:
+        """In a process of its own: other tests fill Hydra's store."""
+        script = str(EXAMPLES / "collect.py")
+        done = subprocess.run([sys.executable, script, "env=null"], capture_output=True, text=True, check=False)
+        names = "cube_move, pick_place, reacher, shelf_place"
+        assert done.stderr.splitlines()[-1] == f"SettingsError: env must be one of {names}, got null"
+        assert "Traceback" not in done.stderr
+
     def test_a_checkpoint_or_several(self, compose: Callable[..., Any]) -> None:
         assert compose("evaluate", "checkpoint=a.zip").checkpoint == "a.zip"
         assert compose("evaluate", "checkpoint=[a.zip,b.zip]").checkpoint == ("a.zip", "b.zip")
@@ -270,13 +283,13 @@ class TestHydra:
         assert "dataset=data/{env.name}: Folder of the dataset to train on (collect)." in lines
 
     def test_takes_a_file_of_ones_own(self, compose: Callable[..., Any], tmp_path: Path) -> None:
-        (tmp_path / "mine.yaml").write_text(
+        (tmp_path / "of_ones_own.yaml").write_text(
             "defaults: [train_offline, {override agent: focus}, _self_]\ntraining: {updates: 3}\n"
         )
-        arguments = ("--config-dir", str(tmp_path), "--config-name", "mine")
+        arguments = ("--config-dir", str(tmp_path), "--config-name", "of_ones_own")
         settings = compose("train_offline", *arguments, "training.seed=5")
         assert (settings.agent, settings.training) == (AGENTS["focus"], Training(updates=3, seed=5))
-        (tmp_path / "mine.yaml").write_text("defaults: [train_offline, _self_]\ntraining: {update: 3}\n")
+        (tmp_path / "of_ones_own.yaml").write_text("defaults: [train_offline, _self_]\ntraining: {update: 3}\n")
         said = compose("train_offline", *arguments)
         assert said.startswith("SettingsError: training.update is no setting; there are updates, seed")
 

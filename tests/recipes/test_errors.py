@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from torchrl_ocwm.agents import build_agent, save_agent
-from torchrl_ocwm.data.collect import CollectionError
+from torchrl_ocwm.data import CollectionError
 from torchrl_ocwm.data.dataset import DatasetError
 from torchrl_ocwm.devices import DeviceError
 from torchrl_ocwm.envs import registry
@@ -170,6 +170,31 @@ def test_a_package_is_missing(command: Callable[..., str], monkeypatch: pytest.M
     monkeypatch.setattr(registry, "find_spec", lambda name: None if name == package else name)
     said = command("collect")
     assert said.startswith(f"MissingPackageError: environment 'reacher' needs {package}, which is not installed: ")
+
+
+@pytest.mark.parametrize("script", ["evaluate", "diagnose"])
+def test_ffmpeg_is_looked_for_first(
+    command: Callable[..., str],
+    scripts: dict[str, ModuleType],
+    files: SimpleNamespace,
+    monkeypatch: pytest.MonkeyPatch,
+    script: str,
+) -> None:
+    """Before the agent is loaded, and only if there is to be a video."""
+
+    def no_ffmpeg() -> None:
+        raise RuntimeError("no ffmpeg")
+
+    def stop(*arguments: Any, **options: Any) -> None:
+        raise WorkerError("loads the agent")
+
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", no_ffmpeg)
+    monkeypatch.setattr(scripts[script], "load_agent", stop)
+    setting = {"evaluate": "video_goals", "diagnose": "video_sequences"}[script]
+    said = command(script, f"checkpoint={files.agent}")
+    assert said.startswith("MissingPackageError: videos need ffmpeg: pip install 'torchrl-ocwm[recipes]'")
+    assert said.endswith(f"or ask for none ({setting}=0)")
+    assert command(script, f"checkpoint={files.agent}", f"{setting}=0") == "WorkerError: loads the agent"
 
 
 def test_a_plugin_is_missing(command: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -16,15 +15,12 @@ import torch
 from rows import shows
 
 import torchrl_ocwm.envs
-from torchrl_ocwm.data.collect import collect
+from torchrl_ocwm.data import Collection, collect, collecting
 from torchrl_ocwm.data.dataset import EpisodeDataset
-from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import ENVIRONMENTS, make_env, make_task
 from torchrl_ocwm.envs.positioning import TARGET_COLOUR
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import reacher_task
-
-collecting = sys.modules["torchrl_ocwm.data.collect"]
 
 
 @contextmanager

@@ -25,8 +25,8 @@ def kinds(base: type) -> Iterator[type]:
 
 def is_of_library(kind: type) -> bool:
     """Not the class of a doctest, which says that it is of the module that it documents."""
-    module = sys.modules[kind.__module__]
-    return kind.__module__.startswith("torchrl_ocwm.") and getattr(module, kind.__name__, None) is kind
+    ours = kind.__module__.startswith("torchrl_ocwm.")
+    return ours and getattr(sys.modules[kind.__module__], kind.__name__, None) is kind
 
 
 def test_every_setting_has_its_row(scripts: dict[str, ModuleType]) -> None:

@@ -15,9 +15,7 @@ from tensordict import TensorDictBase
 
 from torchrl_ocwm.agents import AGENTS, EXPLORERS, Agent, build_agent, collecting_policy, save_agent
 from torchrl_ocwm.agents.presets import AgentConfig
-from torchrl_ocwm.data import EpisodeDataset
-from torchrl_ocwm.data.collect import collect
-from torchrl_ocwm.data.settings import Collection
+from torchrl_ocwm.data import Collection, EpisodeDataset, collect
 from torchrl_ocwm.envs import make_task
 from torchrl_ocwm.training import online as online_module
 from torchrl_ocwm.training.online import Player, collect_seed_steps, train_online

@@ -3,7 +3,7 @@
 from torchrl_ocwm.agents.agent import Agent, Policy
 from torchrl_ocwm.agents.behaviour import LearntBehaviour
 from torchrl_ocwm.agents.build import build_agent
-from torchrl_ocwm.agents.checkpoint import collecting_policy, load_agent, save_agent
+from torchrl_ocwm.agents.checkpoint import collecting_policy, describe, load_agent, save_agent
 from torchrl_ocwm.agents.config import AgentConfig, Behaviour, Learning, Size
 from torchrl_ocwm.agents.explorers import Disagreement, ExplorationReward, ObjectEntropy, StateEntropy
 from torchrl_ocwm.agents.goal_sources import (
@@ -79,6 +79,7 @@ __all__ = [
     "agent_name",
     "build_agent",
     "collecting_policy",
+    "describe",
     "load_agent",
     "register",
     "save_agent",

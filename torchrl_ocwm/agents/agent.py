@@ -47,6 +47,7 @@ class Policy(TensorDictSequential):
 
     @property
     def takes_images(self) -> bool:
+        """Whether it understands goals as images."""
         goal = self.behaviour.goal
         return goal is not None and goal.image is not None
 
@@ -57,6 +58,7 @@ class Policy(TensorDictSequential):
 
     @property
     def takes_positions(self) -> bool:
+        """Whether it understands goals as positions, or takes none."""
         goal = self.behaviour.goal
         return goal is None or goal.position is not None
 

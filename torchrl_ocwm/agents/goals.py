@@ -180,6 +180,7 @@ class SelectObject(nn.Module):
         self.index = index
 
     def forward(self, objects: Tensor) -> Tensor:
+        """Latents ``[..., O, L]`` to that of the object, ``[..., L]``."""
         return objects[..., self.index, :]
 
 

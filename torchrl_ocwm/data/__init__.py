@@ -1,20 +1,26 @@
 """What is kept: collect, store, load, slice."""
 
+from torchrl_ocwm.data.collecting import CollectionError, collect, with_coverage
 from torchrl_ocwm.data.coverage import Coverage, coverage_curve, dataset_coverage, object_coverage, object_positions
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
 from torchrl_ocwm.data.memory import release_pages
 from torchrl_ocwm.data.policies import ScriptedPolicy, SmoothRandomPolicy
-from torchrl_ocwm.data.records import episode_to_records
+from torchrl_ocwm.data.records import STORED, episode_to_records
 from torchrl_ocwm.data.relabel import RelabelGoals
 from torchrl_ocwm.data.replay import make_replay_buffer
+from torchrl_ocwm.data.settings import Collection
 
 __all__ = [
+    "STORED",
+    "Collection",
+    "CollectionError",
     "Coverage",
     "DatasetError",
     "EpisodeDataset",
     "RelabelGoals",
     "ScriptedPolicy",
     "SmoothRandomPolicy",
+    "collect",
     "coverage_curve",
     "dataset_coverage",
     "episode_to_records",
@@ -22,4 +28,5 @@ __all__ = [
     "object_coverage",
     "object_positions",
     "release_pages",
+    "with_coverage",
 ]

@@ -97,11 +97,11 @@ class EpisodeDataset:
         check_fields(dataset._index)
         dataset._index["keys"] = describe(dataset._conform(example))
         with dataset._named_failures("write a dataset here"):
-            _refuse_another(path)
+            refuse_another(path)
             path.mkdir(parents=True, exist_ok=True)
             dataset._start_writing()
             try:
-                _refuse_another(path)  # which was made meanwhile
+                refuse_another(path)  # which was made meanwhile
                 dataset._commit(dataset._index)
                 dataset._make_files()
             except BaseException:
@@ -400,7 +400,8 @@ class EpisodeDataset:
         release_pages(self.records)
 
 
-def _refuse_another(path: Path) -> None:
+def refuse_another(path: Path) -> None:
+    """Raise where a dataset, or what is left of one, is in the way of a new one."""
     if (path / INDEX).exists():
         raise DatasetError(f"{path / INDEX}: there is a dataset here already; open it, or choose another folder")
     left = next((path / _FRAMES).rglob("*.memmap"), None)

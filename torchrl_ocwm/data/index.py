@@ -121,6 +121,8 @@ def _join(name: str, field: str) -> str:
 
 
 def _is(expected: str, holds: Callable[[Any], bool]) -> Check:
+    """A rule for one value; the error names its place, what was expected and what is there."""
+
     def check(name: str, value: Any) -> None:
         if not holds(value):
             shown = repr(value)

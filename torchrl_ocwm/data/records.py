@@ -8,6 +8,27 @@ from tensordict import TensorDictBase
 #: Root keys of a record; all else that a record holds is under "next".
 ROOT_KEYS = ("action", "is_init")
 
+#: What a dataset keeps of an environment's observations.
+STORED = (
+    "action",
+    "is_init",
+    *(
+        ("next", key)
+        for key in (
+            "pixels",
+            "masks",
+            "proprio",
+            "object_position",
+            "object_visible",
+            "goal_position",
+            "object_position_true",
+            "reward",
+            "done",
+            "terminated",
+        )
+    ),
+)
+
 
 def episode_to_records(episode: TensorDictBase) -> TensorDictBase:
     """Turn the T transitions of one episode into T + 1 records, so that each frame is stored once.

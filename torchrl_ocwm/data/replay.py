@@ -26,6 +26,7 @@ class MemoryMappedStorage(TensorStorage):
         self.refusal = refusal
 
     def get(self, index: Any) -> TensorDictBase:
+        """Read records, and give back the memory of the files' pages."""
         data = super().get(index)
         release_pages(self._storage)
         return data
@@ -53,6 +54,7 @@ class StackSlices(Transform):
         self.slice_len = slice_len
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Records ``[B * T]`` to sequences ``[B, T]``, each of which starts anew."""
         sequences = tensordict.reshape(-1, self.slice_len)
         sequences["is_init"][:, 0] = True
         return sequences

@@ -294,6 +294,7 @@ class MaskToPosition(Transform):
         return self._write(tensordict_reset, position, visible, torch.zeros_like(position))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the positions, and whether objects are visible, to the observations."""
         batch_and_objects = observation_spec[self.masks].shape[:-2]
         device = observation_spec.device
         position = Unbounded((*batch_and_objects, len(self.axes)), dtype=torch.float32, device=device)

@@ -1,26 +1,83 @@
-"""How well it did: goals in a grid, scores, reconstruction errors, reports, pictures and videos.
+"""How well it did: goals in a grid, scores, errors of a world model, reports, pictures and videos.
 
-Needs the extra ``recipes``; ``plots`` and ``videos`` are imported from their modules.
+Needs the extra ``recipes``. What draws and films is imported when it is asked for.
 """
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, episode_records, goal_images, measure, transition
+from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
 from torchrl_ocwm.evaluation.imagined import imagined_distance, imagined_rollout
 from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation
+from torchrl_ocwm.evaluation.objects import object_errors
+from torchrl_ocwm.evaluation.open_loop import random_sequences
+from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.reconstruction import ReconstructionError
-from torchrl_ocwm.evaluation.report import Report
+from torchrl_ocwm.evaluation.report import Report, to_json
 from torchrl_ocwm.evaluation.scores import mean_and_error, normalized_score
+from torchrl_ocwm.evaluation.settings import Diagnosis, Evaluation
+
+if TYPE_CHECKING:
+    from torchrl_ocwm.evaluation.object_pictures import draw_errors, draw_goal_latents, picture_objects
+    from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, save_figure
+    from torchrl_ocwm.evaluation.videos import OpenLoopFilm, check_ffmpeg, decode_video, mark, tile, write_video
 
 __all__ = [
+    "Diagnosis",
+    "Evaluation",
     "EvaluationEnvs",
     "LandmarkEvaluation",
+    "OpenLoopFilm",
     "ReconstructionError",
     "Report",
+    "check_ffmpeg",
+    "decode_video",
+    "draw_errors",
+    "draw_goal_latents",
     "episode_records",
     "goal_images",
+    "heatmap",
     "imagined_distance",
     "imagined_rollout",
+    "latent_pairs",
+    "learning_curves",
+    "mark",
+    "match",
     "mean_and_error",
     "measure",
     "normalized_score",
+    "object_errors",
+    "picture_objects",
+    "random_sequences",
+    "save_figure",
+    "tile",
+    "to_json",
     "transition",
+    "write_video",
+    "writing",
 ]
+
+# These need matplotlib or ffmpeg.
+_LAZY = {
+    "OpenLoopFilm": "videos",
+    "check_ffmpeg": "videos",
+    "decode_video": "videos",
+    "draw_errors": "object_pictures",
+    "draw_goal_latents": "object_pictures",
+    "heatmap": "plots",
+    "learning_curves": "plots",
+    "mark": "videos",
+    "picture_objects": "object_pictures",
+    "save_figure": "plots",
+    "tile": "videos",
+    "write_video": "videos",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(import_module(f"torchrl_ocwm.evaluation.{_LAZY[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -26,6 +26,7 @@ class ReconstructionError:
         self.decode = TensorDictSequential(*agent.model.vectors("latent"))
 
     def __call__(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """Decode and compare."""
         latent = tensordict["latent"].select("state", "belief")
         decoded = self.decode(TensorDict({"latent": latent}, latent.batch_size))["latent"]
         errors = {}

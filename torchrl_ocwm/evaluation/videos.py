@@ -22,8 +22,11 @@ from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.modules import ObjectWorldModel, WorldModel
 
 
-def check_ffmpeg() -> None:
+def check_ffmpeg(setting: str) -> None:
     """Raise where no video can be written.
+
+    Args:
+        setting: Name of the setting with which there are none if it is 0.
 
     Raises:
         MissingPackageError: with what to install.
@@ -34,7 +37,7 @@ def check_ffmpeg() -> None:
         imageio_ffmpeg.get_ffmpeg_exe()
     except (ModuleNotFoundError, RuntimeError) as error:
         raise MissingPackageError(
-            "videos need ffmpeg: pip install 'torchrl-ocwm[recipes]', or ask for none (training.video_interval=0)",
+            f"videos need ffmpeg: pip install 'torchrl-ocwm[recipes]', or ask for none ({setting}=0)",
             name="imageio_ffmpeg",
         ) from error
 
@@ -159,7 +162,7 @@ class OpenLoopFilm:
         length: int = 50,
         context: int = 5,
     ) -> None:
-        check_ffmpeg()
+        check_ffmpeg("training.video_interval")
         self.agent, self.folder, self.context = agent, Path(folder), context
         lengths = torch.tensor(dataset.episode_lengths)
         length = min(length, int(lengths.median()))
@@ -170,6 +173,7 @@ class OpenLoopFilm:
 
     @torch.no_grad()
     def __call__(self, updates: int) -> Path:
+        """Write the video of this many updates."""
         model, device = self.agent.model, next(self.agent.parameters()).device
         latents = open_loop_latents(model, self.records.to(device), self.context)
         truth, predicted = self.records["next", "pixels"], decode_video(model, latents).cpu()

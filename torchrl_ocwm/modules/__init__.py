@@ -2,6 +2,7 @@
 
 from torchrl_ocwm.modules.acting import ActingLatent
 from torchrl_ocwm.modules.actor import Actor
+from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.ensemble import DisagreementReward, OneStepEnsemble, disagreement
 from torchrl_ocwm.modules.future_goals import FutureGoals
 from torchrl_ocwm.modules.goals import FrameGoals, GivenGoals, MixedGoals, UniformGoals, UnitRMS
@@ -26,6 +27,7 @@ from torchrl_ocwm.modules.world_model import FlatWorldModel, WorldModel
 __all__ = [
     "ActingLatent",
     "Actor",
+    "Architecture",
     "DisagreementReward",
     "EntropyReward",
     "FlatWorldModel",

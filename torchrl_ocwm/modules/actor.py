@@ -46,5 +46,6 @@ class Actor(nn.Module):
         self.min_std, self.max_std = min_std, max_std
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation ``[..., A]`` of the actions for inputs ``[..., any]``."""
         mean, spread = self.mlp(*inputs).float().chunk(2, -1)
         return mean.tanh(), self.min_std + (self.max_std - self.min_std) * torch.sigmoid(spread + 2)

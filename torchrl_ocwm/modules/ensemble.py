@@ -36,6 +36,7 @@ class StackedLinear(nn.Module):
             nn.init.uniform_(parameter, -1 / math.sqrt(in_features), 1 / math.sqrt(in_features))
 
     def forward(self, inputs: Tensor) -> Tensor:
+        """Inputs ``[M, N, in]`` or ``[1, N, in]`` through the layer of each member, ``[M, N, out]``."""
         return torch.baddbmm(self.bias, inputs.expand(len(self.weight), -1, -1), self.weight)
 
 
@@ -81,6 +82,7 @@ class OneStepEnsemble(nn.Module):
         self.layers = nn.ModuleList(StackedLinear(members, *pair) for pair in pairwise(sizes))
 
     def forward(self, state: Tensor, belief: Tensor, action: Tensor) -> Tensor:
+        """The predictions of all members, ``[M, ..., out]``."""
         inputs = torch.cat([state, belief, bounded(action)], -1)
         hidden = inputs.reshape(1, -1, inputs.shape[-1])
         *first, last = self.layers
@@ -127,6 +129,7 @@ class Disagreement(nn.Module):
         self.ensemble, self.log = ensemble, log
 
     def forward(self, state: Tensor, belief: Tensor, action: Tensor) -> Tensor:
+        """The disagreement of the members, ``[..., 1]``."""
         return disagreement(self.ensemble(state, belief, action), log=self.log)
 
 

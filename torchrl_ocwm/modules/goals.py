@@ -30,6 +30,7 @@ class UnitRMS(nn.Module):
     """
 
     def forward(self, latent: Tensor) -> Tensor:
+        """The same directions ``[..., L]``, with a root mean square of one."""
         return normalize(latent, dim=-1) * latent.shape[-1] ** 0.5
 
 
@@ -54,6 +55,7 @@ class UniformGoals(TensorDictModuleBase):
         self.in_keys, self.out_keys = [like], [goal_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write a goal for each element."""
         device = tensordict.get(self.in_keys[0]).device
         goals = 2 * torch.rand(*tensordict.batch_size, self.dim, device=device) - 1
         return tensordict.set(self.out_keys[0], goals)
@@ -96,6 +98,7 @@ class FrameGoals(TensorDictModuleBase):
         self.in_keys, self.out_keys = list(dict.fromkeys([*goals.in_keys, *visible])), [goal_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the goals of other elements, those of frames that show the object."""
         goals = self.goals(tensordict).get(self.goal_key)
         order = torch.rand(goals.shape[:-1], device=goals.device).flatten()
         if self.object_visible is None:
@@ -141,6 +144,7 @@ class MixedGoals(TensorDictModuleBase):
         self.out_keys = [goal_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write for each element the goal of the one source or of the other."""
         first = self.first(tensordict).get(self.goal_key)
         second = self.second(tensordict).get(self.goal_key)
         choice = torch.rand(*first.shape[:-1], 1, device=first.device) < self.share

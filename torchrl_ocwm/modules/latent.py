@@ -42,6 +42,7 @@ class InitialLatent(TensorDictModuleBase):
         self.in_keys, self.out_keys = [like], [state_key, belief_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write zeros where there is no latent yet."""
         device = tensordict.get(self.in_keys[0]).device
         for key, size in self.sizes.items():
             if tensordict.get(key, None) is None:
@@ -106,6 +107,7 @@ class LatentsInImages(nn.Module):
         self.encoder, self.latent, self.extractor = encoder, latent, extractor
 
     def forward(self, pixels: Tensor) -> Tensor:
+        """What the extractor makes of state and belief after the last image."""
         return self.extractor(*self.latent(self.encoder(pixels)))
 
 
@@ -123,6 +125,7 @@ class LatentsInEmbedding(nn.Module):
         self.images = images
 
     def forward(self, embedding: Tensor) -> Tensor:
+        """What the extractor makes of each image alone."""
         alone = self.images.encoder.image_alone(embedding)
         return self.images.extractor(*self.images.latent(alone.unsqueeze(-2)))
 
@@ -131,4 +134,5 @@ class FullLatent(nn.Module):
     """State ``[..., S]`` and belief ``[..., H]`` as one vector ``[..., S + H]`` float32."""
 
     def forward(self, state: Tensor, belief: Tensor) -> Tensor:
+        """Concatenate the two."""
         return torch.cat([state.float(), belief.float()], -1)

@@ -58,6 +58,7 @@ class StreamingNorm(nn.Module):
         self.square.lerp_(values.float().square().mean(), weight)
 
     def forward(self, values: Tensor) -> Tensor:
+        """Values of any shape, normalised; in training mode they are counted first."""
         if self.training:
             self.update(values)
         if self.mode == "scale":

@@ -49,6 +49,7 @@ class ObjectLatentExtractor(nn.Module):
         self.register_buffer("ids", torch.eye(instances), persistent=False)
 
     def forward(self, *latent: Tensor, first: int | None = None) -> Tensor:
+        """Latents of the instances ``[..., O + 1, L]``, or of the first of them."""
         scene = torch.cat(latent, -1)
         batch, ids = scene.shape[:-1], self.ids[:first]
         scene = scene.unsqueeze(-2).expand(*batch, len(ids), -1)
@@ -80,6 +81,7 @@ class ObjectDecoder(nn.Module):
         self.cnn = make_image_decoder(architecture, features, image_size, channels=4)
 
     def forward(self, object_latent: Tensor) -> tuple[Tensor, Tensor]:
+        """Colours ``[..., N, 3, H, W]`` and mask logits ``[..., N, H, W]``."""
         colours, mask_logits = self.cnn(object_latent).split([3, 1], -3)
         return colours, mask_logits.squeeze(-3)
 
@@ -142,5 +144,6 @@ class LatentPositionalEncoder(nn.Module):
         self.register_buffer("ids", torch.eye(objects), persistent=False)
 
     def forward(self, position: Tensor, object_index: int | None = None) -> Tensor:
+        """Latents ``[..., O, L]`` of positions ``[..., O, D]``, or those of one object."""
         ids = self.ids if object_index is None else self.ids[object_index : object_index + 1]
         return self.mlp(position, ids.expand(*position.shape[:-2], -1, -1))

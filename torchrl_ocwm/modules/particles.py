@@ -62,6 +62,7 @@ class ParticleEntropy(nn.Module):
         self.k, self.clip, self.chunk = k, clip, chunk
 
     def forward(self, latents: Tensor) -> Tensor:
+        """The entropy ``[..., 1]`` at each of the latents ``[..., O, L]``, summed over the objects."""
         *batch, objects, features = latents.shape
         particles = latents.reshape(-1, objects, features).transpose(0, 1)
         entropy = particle_entropy(particles, k=self.k, clip=self.clip, chunk=self.chunk)

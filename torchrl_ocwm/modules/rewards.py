@@ -48,6 +48,7 @@ class PositionDistance(nn.Module):
         self.units, self.object_index = units, object_index
 
     def forward(self, positions: Tensor, goal: Tensor) -> Tensor:
+        """The reward ``[..., 1]`` for positions of all objects ``[..., O * D]`` and goals ``[..., D]``."""
         position = positions.unflatten(-1, (-1, self.units.dim))[..., self.object_index, :]
         return position_distance(self.units.to_metres(position), self.units.to_metres(goal))  # Eq. 3
 
@@ -75,6 +76,7 @@ class LatentSimilarity(nn.Module):
         self.object_index, self.distance = object_index, distance
 
     def forward(self, object_latent: Tensor, goal: Tensor) -> Tensor:
+        """The reward ``[..., 1]`` for latents of all objects ``[..., O, L]`` and goals ``[..., L]``."""
         latent = object_latent[..., self.object_index, :]
         if self.distance == "cosine":
             return cosine_similarity(latent, goal, dim=-1).unsqueeze(-1)

@@ -38,6 +38,7 @@ class TemporalDistance(nn.Module):
         self.last = nn.Linear(widths[-1], 1)
 
     def forward(self, here: Tensor, there: Tensor, *, learning: bool = False) -> Tensor:
+        """The distance ``[..., 1]`` from one embedding ``[..., E]`` to another."""
         hidden = torch.cat([here, there], -1).flatten(0, -2)
         for layer, linear in enumerate(self.linears):
             hidden = linear(hidden)

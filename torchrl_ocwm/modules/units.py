@@ -50,6 +50,7 @@ class WorkspaceUnits(nn.Module):
         return (self.high - self.low) / 2
 
     def forward(self, metres: Tensor) -> Tensor:
+        """Positions ``[..., D]`` in metres as workspace units."""
         if metres.shape[-1] != self.dim:
             raise ValueError(f"positions have {self.dim} coordinates here, got shape {tuple(metres.shape)}")
         return (metres.to(self.low.dtype) - (self.low + self.high) / 2) / self.metres_per_unit

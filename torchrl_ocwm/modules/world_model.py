@@ -287,8 +287,10 @@ def bounded(action: Tensor) -> Tensor:
 
 
 def key_at(at: tuple[str, ...], name: str) -> NestedKey:
+    """The key of something that is kept under a path."""
     return unravel_key((*at, name))
 
 
 def latent_at(at: tuple[str, ...]) -> list[NestedKey]:
+    """The keys of state and belief that are kept under a path."""
     return [key_at(at, "state"), key_at(at, "belief")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
@@ -55,6 +55,7 @@ def recipe(
         def main() -> None:
             with _user_errors():
                 store_options()
+                _check_choices(groups or {}, sys.argv[1:])
             ConfigStore.instance().store(name, _schema(kind, groups or {}, more))
             hydra.main(version_base="1.3", config_path=None, config_name=name)(guarded)()
 
@@ -77,6 +78,14 @@ def store_options() -> None:
         store.store(name, node, group="explore", package=f"agent.behaviours.{EXPLORE}")
     for name, environment in ENVIRONMENTS.items():
         store.store(name, {"name": name, "options": defaults(environment.options)}, group="env")
+
+
+def _check_choices(groups: Iterable[str], arguments: Iterable[str]) -> None:
+    """Hydra has no message for a group of which nothing is chosen."""
+    for group in {argument.partition("=")[0] for argument in arguments if argument.lower().endswith("=null")}:
+        if group in groups:
+            choices = ", ".join(name.removesuffix(".yaml") for name in ConfigStore.instance().list(group))
+            raise SettingsError(f"{group} must be one of {choices}, got null")
 
 
 def keep_settings(settings: Any, folder: Path) -> None:

@@ -15,9 +15,8 @@ from torchrl.trainers.algorithms import DreamerV3UpdateRatio
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.checkpoint import collecting_policy, describe, rebuild
-from torchrl_ocwm.data import EpisodeDataset, episode_to_records
-from torchrl_ocwm.data.collect import STORED, check_failures, collect, count_episode
-from torchrl_ocwm.data.settings import Collection
+from torchrl_ocwm.data import STORED, Collection, EpisodeDataset, collect, episode_to_records
+from torchrl_ocwm.data.collecting import check_failures, count_episode
 from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs import find_environment, make_env
 from torchrl_ocwm.settings import from_dict
@@ -39,7 +38,7 @@ def collect_seed_steps(
     options: dict[str, Any] | None = None,
     progress: bool = True,
 ) -> EpisodeDataset:
-    """Collect the seed steps of an online run (:func:`~torchrl_ocwm.data.collect.collect`), or what is left of them.
+    """Collect the seed steps of an online run (:func:`~torchrl_ocwm.data.collect`), or what is left of them.
 
     Args:
         path: Folder of the dataset.

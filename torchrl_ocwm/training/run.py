@@ -172,6 +172,7 @@ class Sampler:
         )
 
     def __call__(self, batch: TensorDictBase | None = None) -> TensorDictBase:  # noqa: ARG002
+        """The next batch."""
         if len(self.dataset) != self._episodes:
             self._fill()  # the buffer keeps where episodes begin
         return self._replay.sample().select(*self.agent.loss.in_keys, strict=False).to(self.training.device)

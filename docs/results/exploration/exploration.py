@@ -13,9 +13,11 @@ import argparse
 import json
 from pathlib import Path
 
+from matplotlib import pyplot as plt
+
 from torchrl_ocwm.data import Coverage, EpisodeDataset, coverage_curve, object_positions
 from torchrl_ocwm.envs import Task
-from torchrl_ocwm.evaluation.plots import plt, save_figure
+from torchrl_ocwm.evaluation import save_figure
 
 Curves = dict[str, dict[int, Coverage]]
 LABELS = {"visited": "share of the workspace visited", "moves": "share of the steps with motion"}

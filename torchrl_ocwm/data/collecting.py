@@ -11,6 +11,7 @@ from contextlib import ExitStack, closing
 from functools import partial
 from itertools import count, cycle
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import torch
@@ -20,9 +21,9 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_ocwm.data.coverage import dataset_coverage
-from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
+from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset, refuse_another
 from torchrl_ocwm.data.policies import POLICIES, ScriptedPolicy
-from torchrl_ocwm.data.records import episode_to_records
+from torchrl_ocwm.data.records import STORED, episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import ScriptedAction, Task, find_environment, make_env, make_task
@@ -31,34 +32,9 @@ from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.processes import Make, Worker, make_worker
 from torchrl_ocwm.settings import SettingsError
 
-with needs("a collection", "recipes"):
-    from tqdm import tqdm
-
 
 class CollectionError(UserError, RuntimeError):
     """One episode after the other failed, in a simulator or in a process."""
-
-
-#: What a dataset keeps of an environment's observations.
-STORED = (
-    "action",
-    "is_init",
-    *(
-        ("next", key)
-        for key in (
-            "pixels",
-            "masks",
-            "proprio",
-            "object_position",
-            "object_visible",
-            "goal_position",
-            "object_position_true",
-            "reward",
-            "done",
-            "terminated",
-        )
-    ),
-)
 
 
 #: So many episodes in a row may fail.
@@ -98,7 +74,7 @@ def collect(
             (:func:`~torchrl_ocwm.agents.collecting_policy`), or another in its place.
         options: Passed to the environment.
         progress: Show a progress bar with the rate.
-        more: Fields of :class:`~torchrl_ocwm.data.settings.Collection`, where ``settings`` is a number of steps.
+        more: Fields of :class:`~torchrl_ocwm.data.Collection`, where ``settings`` is a number of steps.
 
     Returns:
         The dataset, opened.
@@ -106,10 +82,14 @@ def collect(
     Raises:
         DatasetError: if the folder holds a dataset of another environment or other options, or cannot be written.
         SettingsError: for an unknown policy.
+        MissingPackageError: if tqdm is missing, with the extra to install.
         WorkerError: if a process ends before it has begun.
         CollectionError: if one episode after the other fails, in the simulator or with its process. What fails
             otherwise is raised as a ``RuntimeError``.
     """
+    with needs("a collection", "recipes"):
+        from tqdm import tqdm
+
     if isinstance(settings, int):
         settings = Collection(steps=settings, **more)
     options = options or {}
@@ -272,7 +252,13 @@ def with_coverage(dataset: EpisodeDataset, task: Task) -> EpisodeDataset:
 
 
 def _open_if_there(path: Path, source: dict[str, Any]) -> EpisodeDataset | None:
+    """The dataset in a folder that can be written to; ``None`` if there is none yet, and the folder can be made."""
+    try:
+        TemporaryFile(dir=next(one for one in (path, *path.parents) if one.exists())).close()
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot write a dataset here ({error.strerror or error})") from error
     if not (path / "dataset.json").exists():
+        refuse_another(path)
         return None
     dataset = EpisodeDataset.open(path, write=True)  # it may have been killed before the first episode
     there = {key: dataset.metadata.get(key) for key in source}

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import sys
 import time
 
 import pytest
@@ -15,15 +14,23 @@ from torchrl.envs.utils import ExplorationType, exploration_type, set_exploratio
 from torchrl_ocwm import build_agent, save_agent
 from torchrl_ocwm.agents import AGENTS, EXPLORERS, collecting_policy
 from torchrl_ocwm.agents.checkpoint import describe
-from torchrl_ocwm.data import DatasetError, EpisodeDataset, ScriptedPolicy, SmoothRandomPolicy, object_coverage
-from torchrl_ocwm.data.collect import CollectionError, EpisodePlayer, collect
-from torchrl_ocwm.data.settings import Collection
+from torchrl_ocwm.data import (
+    Collection,
+    CollectionError,
+    DatasetError,
+    EpisodeDataset,
+    ScriptedPolicy,
+    SmoothRandomPolicy,
+    collect,
+    collecting,
+    object_coverage,
+)
+from torchrl_ocwm.data.collecting import EpisodePlayer
 from torchrl_ocwm.envs import Reacher, SimulationDivergedError, Task, make_task
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.processes import WorkerError
 from torchrl_ocwm.settings import SettingsError
 
-collect_module = sys.modules["torchrl_ocwm.data.collect"]
 OPTIONS = {"horizon": 20, "image_size": 32}
 
 
@@ -44,7 +51,7 @@ def collected(tmp_path_factory):
 
 @pytest.fixture
 def no_collector(monkeypatch):
-    monkeypatch.setattr(collect_module, "play_in_order", None)
+    monkeypatch.setattr(collecting, "play_in_order", None)
 
 
 def episodes(dataset: EpisodeDataset):
@@ -267,6 +274,22 @@ def test_file_that_is_no_checkpoint(tmp_path, no_collector):
         gather(tmp_path / "data", 20, policy=tmp_path / "file")
 
 
+def test_a_place_for_no_dataset_is_refused_before_an_episode_is_played(tmp_path, no_collector):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(DatasetError, match=r"/file: cannot write a dataset here \(Not a directory\)"):
+        gather(tmp_path / "file", 20)
+    with pytest.raises(DatasetError, match=r"/file/data: cannot write a dataset here \(Not a directory\)"):
+        gather(tmp_path / "file" / "data", 20)
+    with pytest.raises(DatasetError, match=r"cannot write a dataset here"):
+        gather("/proc/data", 20)
+    left = tmp_path / "left" / "frames" / "reward.memmap"
+    left.parent.mkdir(parents=True)
+    left.touch()
+    with pytest.raises(DatasetError, match="frames of a dataset without dataset.json"):
+        gather(tmp_path / "left", 20)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
 class BreaksAt(EpisodePlayer):
     """Its simulator breaks in some episodes."""
 
@@ -281,7 +304,7 @@ class BreaksAt(EpisodePlayer):
 
 def test_failed_episode_is_left_out(tmp_path, monkeypatch):
     whole = episodes(gather(tmp_path / "whole", 100))
-    monkeypatch.setattr(collect_module, "EpisodePlayer", BreaksAt)
+    monkeypatch.setattr(collecting, "EpisodePlayer", BreaksAt)
     message = r"an episode failed \(the simulation diverged\) and is left out; a new process goes on"
     with pytest.warns(RuntimeWarning, match=message):
         dataset = gather(tmp_path / "data", 60)
@@ -293,7 +316,7 @@ def test_failed_episode_is_left_out(tmp_path, monkeypatch):
 def test_numbers_of_episodes_that_failed_are_not_used_again(tmp_path, monkeypatch):
     """Also by a collection that goes on."""
     whole = episodes(gather(tmp_path / "whole", 80))
-    monkeypatch.setattr(collect_module, "EpisodePlayer", BreaksAt)
+    monkeypatch.setattr(collecting, "EpisodePlayer", BreaksAt)
     monkeypatch.setattr(BreaksAt, "numbers", (1,))
     with pytest.warns(RuntimeWarning, match="is left out"):
         gather(tmp_path / "data", 40)
@@ -303,7 +326,7 @@ def test_numbers_of_episodes_that_failed_are_not_used_again(tmp_path, monkeypatc
 
 
 def test_simulator_that_fails_again_and_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(collect_module, "EpisodePlayer", BreaksAt)
+    monkeypatch.setattr(collecting, "EpisodePlayer", BreaksAt)
     monkeypatch.setattr(BreaksAt, "numbers", range(100))
     message = "4 episodes failed in a row, the last one with: the simulation diverged"
     with pytest.warns(RuntimeWarning), pytest.raises(RuntimeError, match=message) as raised:
@@ -317,7 +340,7 @@ def test_simulator_that_fails_again_and_again(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("error", [TypeError("a bug"), NotImplementedError("no scripted policy")])
 def test_errors_that_are_not_the_simulators_are_raised_at_once(tmp_path, monkeypatch, error):
-    monkeypatch.setattr(collect_module, "EpisodePlayer", BreaksAt)
+    monkeypatch.setattr(collecting, "EpisodePlayer", BreaksAt)
     monkeypatch.setattr(BreaksAt, "error", error)
     with pytest.raises(type(error), match=str(error)):
         gather(tmp_path / "data", 60)
