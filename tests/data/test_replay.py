@@ -48,7 +48,7 @@ class Counter(EnvBase):
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    """Eight episodes from a TorchRL collector with the arguments of torchrl_ocwm.data.collecting."""
+    """Eight episodes from a TorchRL collector with the arguments of torchrl_ocwm.data.collect."""
     policy = TensorDictModule(lambda count: torch.rand_like(count), in_keys=["count"], out_keys=["action"])
     collector = Collector(
         TransformedEnv(Counter(), InitTracker()),

@@ -1,6 +1,6 @@
 """What is kept: collect, store, load, slice."""
 
-from torchrl_ocwm.data.collecting import CollectionError, collect, with_coverage
+from torchrl_ocwm.data.collect import CollectionError, collect, with_coverage
 from torchrl_ocwm.data.coverage import Coverage, coverage_curve, dataset_coverage, object_coverage, object_positions
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
 from torchrl_ocwm.data.memory import release_pages

@@ -16,7 +16,7 @@ from torchrl.trainers.algorithms import DreamerV3UpdateRatio
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.checkpoint import collecting_policy, describe, rebuild
 from torchrl_ocwm.data import STORED, Collection, EpisodeDataset, collect, episode_to_records
-from torchrl_ocwm.data.collecting import check_failures, count_episode
+from torchrl_ocwm.data.collect import check_failures, count_episode
 from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs import find_environment, make_env
 from torchrl_ocwm.settings import from_dict

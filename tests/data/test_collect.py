@@ -1,5 +1,6 @@
 """Collecting with processes: whole, continuous episodes, a folder that can be continued, and only with its own kind."""
 
+import importlib
 import json
 import os
 import signal
@@ -22,15 +23,15 @@ from torchrl_ocwm.data import (
     ScriptedPolicy,
     SmoothRandomPolicy,
     collect,
-    collecting,
     object_coverage,
 )
-from torchrl_ocwm.data.collecting import EpisodePlayer
+from torchrl_ocwm.data.collect import EpisodePlayer
 from torchrl_ocwm.envs import Reacher, SimulationDivergedError, Task, make_task
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.processes import WorkerError
 from torchrl_ocwm.settings import SettingsError
 
+collecting = importlib.import_module("torchrl_ocwm.data.collect")  # the name in the package is the function
 OPTIONS = {"horizon": 20, "image_size": 32}
 
 
