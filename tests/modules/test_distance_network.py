@@ -69,3 +69,11 @@ def test_reward_is_minus_the_distance_from_state_to_goal() -> None:
     reward = TemporalDistanceReward(Ask(), embedding_key="mine", goal_key="aim", reward_key="r")
     assert (reward(data)["r"] == -4).all()
     assert data["r"].shape == (2, 3, 1)
+
+
+def test_any_shape_of_batch() -> None:
+    network = TemporalDistance(3, layers=2, units=8, batch_norm=True)
+    here, there = torch.rand(4, 5, 3), torch.rand(4, 5, 3)
+    distance = network(here, there)
+    torch.testing.assert_close(network(here.flatten(0, 1), there.flatten(0, 1)), distance.flatten(0, 1))
+    torch.testing.assert_close(network(here[0, 0], there[0, 0]), distance[0, 0])

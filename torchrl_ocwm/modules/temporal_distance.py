@@ -39,7 +39,7 @@ class TemporalDistance(nn.Module):
 
     def forward(self, here: Tensor, there: Tensor, *, learning: bool = False) -> Tensor:
         """The distance ``[..., 1]`` from one embedding ``[..., E]`` to another."""
-        hidden = torch.cat([here, there], -1).flatten(0, -2)
+        hidden = torch.cat([here, there], -1).reshape(-1, 2 * here.shape[-1])
         for layer, linear in enumerate(self.linears):
             hidden = linear(hidden)
             if self.norms:
