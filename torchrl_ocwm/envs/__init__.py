@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from torchrl_ocwm.envs.opengl import import_mujoco
 
@@ -26,6 +25,7 @@ from torchrl_ocwm.envs.registry import (
 from torchrl_ocwm.envs.scripted import ScriptedAction
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.envs.workspace import Workspace
+from torchrl_ocwm.lazy import lazily
 
 if TYPE_CHECKING:
     from torchrl_ocwm.envs.camera import Camera, Frame
@@ -62,19 +62,16 @@ __all__ = [
 ]
 
 # These need a simulator, so they are imported when they are asked for.
-_LAZY = {
-    "Camera": "camera",
-    "CubeMove": "cube_move",
-    "Frame": "camera",
-    "PickPlace": "meta_world",
-    "PositioningEnv": "positioning",
-    "Reacher": "reacher",
-    "ShelfPlace": "meta_world",
-    "SimulationDivergedError": "positioning",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(import_module(f"torchrl_ocwm.envs.{_LAZY[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazily(
+    __name__,
+    {
+        "Camera": "camera",
+        "CubeMove": "cube_move",
+        "Frame": "camera",
+        "PickPlace": "meta_world",
+        "PositioningEnv": "positioning",
+        "Reacher": "reacher",
+        "ShelfPlace": "meta_world",
+        "SimulationDivergedError": "positioning",
+    },
+)

@@ -5,8 +5,7 @@ Needs the extra ``recipes``. What draws and films is imported when it is asked f
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, episode_records, goal_images, measure, transition
 from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
@@ -19,6 +18,7 @@ from torchrl_ocwm.evaluation.reconstruction import ReconstructionError
 from torchrl_ocwm.evaluation.report import Report, to_json
 from torchrl_ocwm.evaluation.scores import mean_and_error, normalized_score
 from torchrl_ocwm.evaluation.settings import Diagnosis, Evaluation
+from torchrl_ocwm.lazy import lazily
 
 if TYPE_CHECKING:
     from torchrl_ocwm.evaluation.object_pictures import draw_errors, draw_goal_latents, picture_objects
@@ -61,23 +61,20 @@ __all__ = [
 ]
 
 # These need matplotlib or ffmpeg.
-_LAZY = {
-    "OpenLoopFilm": "videos",
-    "check_ffmpeg": "videos",
-    "decode_video": "videos",
-    "draw_errors": "object_pictures",
-    "draw_goal_latents": "object_pictures",
-    "heatmap": "plots",
-    "learning_curves": "plots",
-    "mark": "videos",
-    "picture_objects": "object_pictures",
-    "save_figure": "plots",
-    "tile": "videos",
-    "write_video": "videos",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(import_module(f"torchrl_ocwm.evaluation.{_LAZY[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazily(
+    __name__,
+    {
+        "OpenLoopFilm": "videos",
+        "check_ffmpeg": "videos",
+        "decode_video": "videos",
+        "draw_errors": "object_pictures",
+        "draw_goal_latents": "object_pictures",
+        "heatmap": "plots",
+        "learning_curves": "plots",
+        "mark": "videos",
+        "picture_objects": "object_pictures",
+        "save_figure": "plots",
+        "tile": "videos",
+        "write_video": "videos",
+    },
+)
