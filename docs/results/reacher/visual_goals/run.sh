@@ -19,5 +19,5 @@ for seed in ${SEEDS:-0 1}; do
     echo "$name $(($(stat -c %Y $run/checkpoint.zip) - $(stat -c %Y $run/config.yaml))) s" >> $here/wall_time.txt
   done
 done
-python examples/evaluate.py goals=100 image_goals=true workers=1 envs=10 output=$here \
+python examples/evaluate.py goals=36 image_goals=true workers=0 envs=18 output=$here \
   "checkpoint=[$(IFS=,; echo "${checkpoints[*]}")]"
