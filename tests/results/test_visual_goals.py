@@ -1,0 +1,57 @@
+"""What the page of goals as images says is in the files beside it."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import pytest
+from reading import RESULTS, mean, page, report, settings, unchecked
+
+NAME = "reacher/visual_goals"
+AGENTS = {"focus_lcp": "FOCUS + LCP", "lexa_cosine": "LEXA cosine", "lexa_temporal": "LEXA temporal"}
+#: What was done: no file beside the page has these numbers.
+STATED = ["At commit 45c8d50", "PyTorch 2.13.0 on the CPU", "within 5 cm of all of them"]
+
+
+def protocol() -> list[str]:
+    """How the runs were made."""
+    numbers = report(NAME)
+    runs = [settings(NAME, file.stem)["training"] for file in (RESULTS / NAME).glob("*_seed_*.yaml")]
+    (updates,) = {run["updates"] for run in runs}
+    (steps,) = re.findall(r"steps=(\d+)", (RESULTS / NAME / "run.sh").read_text())
+    side, each = math.isqrt(len(numbers.goals)), numbers.settings["episode_steps"]
+    return [
+        f"the same {int(steps):,} steps of data, {updates:,} updates",
+        f"{len(numbers.goals)} goals, a {side} × {side} grid over what the arm can reach; {each} steps each",
+    ]
+
+
+def measured() -> list[str]:
+    """Scores and distances with images as goals."""
+    numbers = report(NAME)
+    images = {agent: f"{agent}, image goals" for agent in AGENTS}
+    sentences = [
+        f"**{shown} scores {mean(numbers, images[agent], 'final_score'):.2f} and ends "
+        f"{mean(numbers, images[agent], 'final_distance', 100):.1f} cm from its goals"
+        for agent, shown in AGENTS.items()
+    ]
+    assert mean(numbers, images["focus_lcp"], "success") == 1
+    lost = mean(numbers, "focus_lcp", "final_score") - mean(numbers, images["focus_lcp"], "final_score")
+    imagined = mean(numbers, images["lexa_temporal"], "imagined_distance", 100)
+    return [
+        *sentences,
+        f"would add is {lost:.2f}",
+        f"within 5 cm of {mean(numbers, images['lexa_cosine'], 'success'):.0%} of its goals",
+        f"random actions ({mean(numbers, 'random', 'final_score'):.2f})",
+        f"expects to end {imagined:.1f} cm off",
+    ]
+
+
+@pytest.mark.parametrize("sentence", [*measured(), *protocol(), *STATED])
+def test_sentence(sentence: str) -> None:
+    assert sentence in page(NAME)
+
+
+def test_no_number_is_unchecked() -> None:
+    assert unchecked(NAME, [*measured(), *protocol(), *STATED]) == []
