@@ -8,7 +8,9 @@ import pytest
 from reading import RESULTS, ROOT, cell, report
 
 
-@pytest.mark.parametrize("name", ["reacher", "reacher/ablations", "reacher/visual_goals", "cube_move"])
+@pytest.mark.parametrize(
+    "name", ["reacher", "reacher/ablations", "reacher/visual_goals", "reacher/planner", "cube_move"]
+)
 def test_tables_are_those_of_the_numbers(name: str) -> None:
     table = report(name).markdown()
     assert (RESULTS / name / "results.md").read_text() == table + "\n"

@@ -1,0 +1,39 @@
+"""What the page of planner and policy says is in the files beside it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from reading import mean, page, report, settings, unchecked
+
+NAME = "reacher/planner"
+#: What was done: no file beside the page has these numbers.
+STATED = ["At commit b6f52b5", "PyTorch 2.13.0 on the CPU"]
+
+
+def sentences() -> list[str]:
+    numbers = report(NAME)
+    given = numbers.settings
+    goals, horizon, candidates, drawn = len(numbers.goals), given["horizon"], given["candidates"], given["iterations"]
+    planner, policy = (mean(numbers, name, "final_distance", 1000) for name in ("planner", "policy"))
+    updates = settings("reacher/visual_goals", "focus_lcp_seed_0")["training"]["updates"]
+    return [
+        f"{goals} goals, a {math.isqrt(goals)} × {math.isqrt(goals)} grid over what the arm can reach; "
+        f"{given['steps']} steps each",
+        f"looks {horizon} steps ahead, with {candidates} candidates that are drawn {drawn} times",
+        f"The planner stops {planner:.0f} mm from its goals, the policy {policy:.0f} mm",
+        f"has learnt in {updates:,} updates",
+        f"With {goals} goals and one seed",
+        f"it imagines {horizon} × {drawn} steps of {candidates} candidates",
+        f"with {updates:,} updates, with positions",
+    ]
+
+
+@pytest.mark.parametrize("sentence", [*sentences(), *STATED])
+def test_sentence(sentence: str) -> None:
+    assert sentence in page(NAME)
+
+
+def test_no_number_is_unchecked() -> None:
+    assert unchecked(NAME, [*sentences(), *STATED]) == []
