@@ -6,7 +6,7 @@ import json
 import math
 
 import pytest
-from reading import RESULTS, curve, diagnosis, mean, page, report, settings, unchecked
+from reading import RESULTS, ROOT, curve, diagnosis, mean, page, report, settings, unchecked
 
 #: What was done, or what the paper says: no file beside the page has these numbers.
 STATED = [
@@ -97,3 +97,47 @@ def test_sentence(sentence: str) -> None:
 
 def test_no_number_is_unchecked() -> None:
     assert unchecked("cube_move", [*measured(), *protocol(), *STATED]) == []
+
+
+ONLINE = "cube_move/online"
+#: What was done: no file beside the page has these numbers.
+STATED_ONLINE = ["At commit 45c8d50 on 2026-11-25", "PyTorch 2.13.0 on the CPU", "took 91 minutes"]
+
+
+def online() -> list[str]:
+    """Rounds of acting and training in one command."""
+    numbers, before = report(ONLINE), report("cube_move")
+    made = settings(ONLINE, "focus_lcp_seed_0")
+    first, updates = made["online"]["seed_updates"], made["training"]["updates"]
+    scores = curve(RESULTS / ONLINE / "focus_lcp_seed_0.csv")
+    steps = curve(RESULTS / ONLINE / "focus_lcp_seed_0_steps.csv")
+    *rounds, last = [f"{score:.2f}" for update, score in scores.items() if update > first]
+    rows = ("focus_lcp", "focus_lcp, image goals")
+    assert all(mean(numbers, row, "final_score") > mean(before, row, "final_score") for row in rows)
+    was = " and ".join(f"{mean(before, row, 'final_score'):.2f}" for row in rows)
+    goals, side = len(numbers.goals), math.isqrt(len(numbers.goals))
+    return [
+        f"{goals} goals, a {side} × {side} grid over the workspace; {numbers.settings['episode_steps']} steps each",
+        f"Before, the scores were {was}",
+        f"After {first:,} updates on the scripted and random data the score on ten landmark goals is "
+        f"{scores[first]:.2f}",
+        f"After the rounds it is {', '.join(rounds)} and {last}",
+        f"the dataset has {max(steps.values()):,.0f} steps",
+        f"{updates:,} updates with one thread",
+    ]
+
+
+@pytest.mark.parametrize("sentence", [*online(), *STATED_ONLINE])
+def test_sentence_on_the_online_run(sentence: str) -> None:
+    assert sentence in page(ONLINE)
+
+
+def test_no_number_of_the_online_run_is_unchecked() -> None:
+    assert unchecked(ONLINE, [*online(), *STATED_ONLINE]) == []
+
+
+def test_online_scores_of_the_readme() -> None:
+    scores = [mean(report(ONLINE), row, "final_score") for row in ("focus_lcp", "focus_lcp, image goals")]
+    assert f"alone scores {scores[0]:.2f}, with images {scores[1]:.2f}" in " ".join(
+        (ROOT / "README.md").read_text().split()
+    )

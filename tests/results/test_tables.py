@@ -9,7 +9,7 @@ from reading import RESULTS, ROOT, cell, report
 
 
 @pytest.mark.parametrize(
-    "name", ["reacher", "reacher/ablations", "reacher/visual_goals", "reacher/planner", "cube_move"]
+    "name", ["reacher", "reacher/ablations", "reacher/visual_goals", "reacher/planner", "cube_move", "cube_move/online"]
 )
 def test_tables_are_those_of_the_numbers(name: str) -> None:
     table = report(name).markdown()
