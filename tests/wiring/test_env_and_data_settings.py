@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -15,7 +16,7 @@ import torch
 from rows import shows
 
 import torchrl_ocwm.envs
-from torchrl_ocwm.data import Collection, collect, collecting
+from torchrl_ocwm.data import Collection, collect
 from torchrl_ocwm.data.dataset import EpisodeDataset
 from torchrl_ocwm.envs import ENVIRONMENTS, make_env, make_task
 from torchrl_ocwm.envs.positioning import TARGET_COLOUR
@@ -144,6 +145,7 @@ def test_seed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("workers", "processes"), [(0, [False]), (1, [True]), (3, [True] * 3)])
 def test_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int, processes: list[bool]) -> None:
     """So many processes, with that timeout; here all of them are this one."""
+    collecting = importlib.import_module("torchrl_ocwm.data.collect")  # the name in the package is the function
     made, make = [], collecting.make_worker
 
     def note(player: Any, *, process: bool, timeout: float) -> Any:
