@@ -44,13 +44,14 @@ def registries() -> Iterator[None]:
 
 @pytest.mark.usefixtures("registries")
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=lambda page: page.stem)
-@pytest.mark.usefixtures("registries")
 def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     module = ModuleType("docs_page")
     monkeypatch.setitem(sys.modules, module.__name__, module)
+    names = set(vars(module))
     for number, block in enumerate(blocks(page)):
         exec(compile(block, f"{page.name}, block {number}", "exec", dont_inherit=True), module.__dict__)
+    assert set(vars(module)) > names
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -67,3 +67,9 @@ def unchecked(name: str, sentences: Sequence[str]) -> list[str]:
     for sentence in sorted(sentences, key=len, reverse=True):
         prose = prose.replace(" ".join(NOT_PROSE.sub("", sentence).split()), "")
     return NUMBER.findall(prose)
+
+
+def missing(name: str, sentences: Sequence[str]) -> list[str]:
+    """Those of the sentences that the page does not say."""
+    text = page(name)
+    return [sentence for sentence in sentences if sentence not in text]

@@ -82,6 +82,7 @@ class _Negative(nn.Module):
         self.distance = distance
 
     def forward(self, here: Tensor, there: Tensor) -> Tensor:
+        """Minus the distance, ``[..., 1]``."""
         return -self.distance(here, there)
 
 
