@@ -108,3 +108,20 @@ def test_speed_of_updates_beside_another_commit(
     assert operations == before
     assert min(float(cell) for cell in (gflop, seconds, rate, ratio)) > 0
     assert 0 <= float(efficiency) < 1
+
+
+def test_how_updates_are_timed(update_speed: ModuleType) -> None:
+    """Options reach the update: here those that would not be seen in a table."""
+    options = {"rounds": 1, "updates": 3, "threads": 2, "device": "cpu", "mixed_precision": True, "compile": True}
+    threads = torch.get_num_threads()
+    try:
+        update = update_speed.Update("dreamer", "debug", options)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert (update.stepper.mixed_precision, update.stepper.compile_train_step) == (True, True)
+    assert (update.eager.mixed_precision, update.eager.compile_train_step) == (True, False)
+    calls = []
+    update.stepper.step = lambda trainer, batch: calls.append(batch)
+    update.round()
+    assert len(calls) == 3
