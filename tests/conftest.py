@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -26,6 +27,9 @@ from torchrl_ocwm.testing import random_records, reacher_task
 EXAMPLES = Path(__file__).parents[1] / "examples"
 #: What a command of a recipe has to say, whatever else it says.
 REQUIRED = {"evaluate": ["checkpoint=a.zip"], "diagnose": ["checkpoint=a.zip", "dataset=data"]}
+
+# A shell that runs the tests in the background lets them, and what they start, ignore Ctrl-C.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 collect_ignore = ["plugin/ocwm_example"]  # a package that the tests import when they want its parts
 
