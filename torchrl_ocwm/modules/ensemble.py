@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import elu, rms_norm, silu
 
 from torchrl_ocwm.modules.architecture import Style
-from torchrl_ocwm.modules.world_model import bounded
+from torchrl_ocwm.modules.recurrence import bounded
 from torchrl_ocwm.settings import read
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.modules import RSSMPosteriorV3, RSSMPriorV3, RSSMStateEstimatorV3
+from torchrl.modules import RSSMPosteriorV3, RSSMPriorV3
 
 from torchrl_ocwm.modules.observation import ObservationEncoder
 
@@ -76,19 +76,18 @@ class LatentOfImages(nn.Module):
 
     def __init__(self, prior: RSSMPriorV3, posterior: RSSMPosteriorV3, *, state: int, belief: int, action: int) -> None:
         super().__init__()
-        self.sizes = {"state": state, "belief": belief, "previous_action": action}
-        self.estimator = RSSMStateEstimatorV3(prior, posterior)
+        self.prior, self.posterior = prior, posterior
+        self.sizes = (state, belief, action)
 
     def forward(self, embeddings: Tensor) -> tuple[Tensor, Tensor]:
         """State and belief after the last image."""
         shape = embeddings.shape[:-2]
         embeddings = embeddings.reshape(-1, *embeddings.shape[-2:])  # a GRU takes one batch dimension
-        count = embeddings.shape[:1]
-        latent = TensorDict({name: embeddings.new_zeros(*count, size) for name, size in self.sizes.items()}, count)
-        latent["is_init"] = torch.zeros(*count, 1, dtype=torch.bool, device=embeddings.device)
+        state, belief, action = (embeddings.new_zeros(len(embeddings), size) for size in self.sizes)
         for embedding in embeddings.unbind(-2):
-            latent = self.estimator(latent.set("encoded_latents", embedding))
-        return latent["state"].reshape(*shape, -1), latent["belief"].reshape(*shape, -1)
+            belief = self.prior._update_belief(state, belief, action)
+            _, state = self.posterior(belief, embedding)
+        return state.float().reshape(*shape, -1), belief.float().reshape(*shape, -1)
 
 
 class LatentsInImages(nn.Module):

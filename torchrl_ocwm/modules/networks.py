@@ -15,12 +15,12 @@ from torchrl.modules import (
     DreamerV3MLP,
     ObsDecoder,
     ObsEncoder,
-    RSSMPosteriorV3,
-    RSSMPriorV3,
 )
 
 from torchrl_ocwm.modules.architecture import Architecture, Style
 from torchrl_ocwm.modules.dtypes import unit_image
+from torchrl_ocwm.modules.recurrence import BlockGRU, Posterior, Prior
+from torchrl_ocwm.modules.rms_norm import fast_norms
 from torchrl_ocwm.settings import SettingsError, read
 
 UNIMIX = 0.01
@@ -45,7 +45,7 @@ def make_mlp(
     """
     read(Style, style, "style")
     if style == "dreamer_v3":
-        return DreamerV3MLP(in_features, out_features, depth=layers, num_cells=units, outscale=outscale)
+        return fast_norms(DreamerV3MLP(in_features, out_features, depth=layers, num_cells=units, outscale=outscale))
     if out_features is None:
         return MLP(in_features, units, layers - 1, units, activation_class=nn.ELU, activate_last_layer=True)
     mlp = MLP(in_features, out_features, layers, units, activation_class=nn.ELU)
@@ -65,7 +65,7 @@ def make_image_encoder(architecture: Architecture, image_size: int) -> tuple[nn.
     _check_image_size(architecture, image_size)
     if architecture.style == "dreamer_v3":
         encoder = DreamerV3ImageEncoder(3, depth, mults)
-        return encoder, encoder.output_features((3, image_size, image_size))
+        return fast_norms(encoder), encoder.output_features((3, image_size, image_size))
     return nn.Sequential(_ScaledImage(), ObsEncoder(depth, in_channels=3)), depth * 8 * 2 * 2
 
 
@@ -76,11 +76,12 @@ def make_image_decoder(
     depth, mults = architecture.cnn_depth, architecture.cnn_mults
     _check_image_size(architecture, image_size)
     if architecture.style == "dreamer_v3":
-        return DreamerV3ImageDecoder(in_features, (channels, image_size, image_size), depth, mults, num_blocks=1)
+        shape = (channels, image_size, image_size)
+        return fast_norms(DreamerV3ImageDecoder(in_features, shape, depth, mults, num_blocks=1))
     return _ShiftedImage(ObsDecoder(depth, latent_dim=in_features, out_channels=channels))
 
 
-def make_rssm(architecture: Architecture, *, action: int, embedding: int) -> tuple[RSSMPriorV3, RSSMPosteriorV3]:
+def make_rssm(architecture: Architecture, *, action: int, embedding: int) -> tuple[Prior, Posterior]:
     """Prior and posterior of a discrete RSSM.
 
     Args:
@@ -89,7 +90,7 @@ def make_rssm(architecture: Architecture, *, action: int, embedding: int) -> tup
         embedding: Features of an embedded observation.
     """
     v3 = architecture.style == "dreamer_v3"
-    prior = RSSMPriorV3(
+    prior = Prior(
         action_shape=(action,),
         action_dim=action,
         hidden_dim=architecture.hidden,
@@ -100,7 +101,7 @@ def make_rssm(architecture: Architecture, *, action: int, embedding: int) -> tup
         num_blocks=architecture.gru_blocks,
         unimix=UNIMIX,
     )
-    posterior = RSSMPosteriorV3(
+    posterior = Posterior(
         hidden_dim=architecture.hidden,
         rnn_hidden_dim=architecture.belief,
         obs_embed_dim=embedding,
@@ -109,7 +110,9 @@ def make_rssm(architecture: Architecture, *, action: int, embedding: int) -> tup
         use_rms_norm=v3,
         unimix=UNIMIX,
     )
-    return prior, posterior
+    if v3:
+        prior.rnn = BlockGRU(prior.rnn)
+    return fast_norms(prior), fast_norms(posterior)
 
 
 def _check_image_size(architecture: Architecture, image_size: int) -> None:

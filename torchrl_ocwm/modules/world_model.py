@@ -10,12 +10,13 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.modules import RSSMRolloutV3, RSSMStateEstimatorV3, SymExpTwoHot
+from torchrl.modules import RSSMStateEstimatorV3, SymExpTwoHot
 
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.latent import FullLatent, InitialLatent, LatentOfImages, LatentsInEmbedding, LatentsInImages
 from torchrl_ocwm.modules.networks import make_image_decoder, make_mlp, make_rssm
 from torchrl_ocwm.modules.observation import ObservationEncoder
+from torchrl_ocwm.modules.recurrence import Rollout
 from torchrl_ocwm.modules.units import WorkspaceUnits
 from torchrl_ocwm.settings import SettingsError
 
@@ -83,10 +84,10 @@ class WorldModel(nn.Module, ABC):
 
         Recorded actions beyond [−1, 1] count as clipped, as they do in imagination and in acting.
         """
-        rollout = RSSMRolloutV3(
+        rollout = Rollout(
             TensorDictModule(
                 self.prior,
-                in_keys=["state", "belief", "bounded_action"],
+                in_keys=["state", "belief", "action"],
                 out_keys=[("next", "prior_logits"), ("next", "state"), ("next", "belief")],
             ),
             TensorDictModule(
@@ -98,7 +99,6 @@ class WorldModel(nn.Module, ABC):
         rollout.in_keys = [*rollout.in_keys, "is_init"]  # TorchRL's takes it as optional: then memory crosses episodes
         return TensorDictSequential(
             InitialLatent(self.state, self.belief),
-            TensorDictModule(bounded, ["action"], ["bounded_action"]),
             *self._encode("next"),
             rollout,
             *self.decoders("next"),
@@ -150,8 +150,7 @@ class WorldModel(nn.Module, ABC):
         """Next state and belief, sampled from the prior. Actions beyond [−1, 1] count as clipped."""
         latent = latent_at(("latent",))
         return TensorDictSequential(
-            TensorDictModule(bounded, ["action"], ["bounded_action"]),
-            TensorDictModule(self.prior, [*latent, "bounded_action"], ["_", *latent]),
+            TensorDictModule(self.prior, [*latent, "action"], ["_", *latent]),
         )
 
     def reward(self) -> TensorDictSequential:
@@ -278,12 +277,6 @@ class _ObjectUnits(nn.Module):
 
     def forward(self, metres: Tensor) -> Tensor:
         return self.units(metres).flatten(-2)
-
-
-def bounded(action: Tensor) -> Tensor:
-    """Clip to [−1, 1] and keep a gradient beyond, as TorchRL's block GRU does by itself."""
-    action = action.float()
-    return action / action.detach().abs().clamp_min(1)
 
 
 def key_at(at: tuple[str, ...], name: str) -> NestedKey:
