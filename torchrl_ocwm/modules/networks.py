@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import conv_transpose2d, silu
 from torchrl.modules import (
     MLP,
     DreamerV3ImageDecoder,
@@ -77,7 +78,7 @@ def make_image_decoder(
     _check_image_size(architecture, image_size)
     if architecture.style == "dreamer_v3":
         shape = (channels, image_size, image_size)
-        return fast_norms(DreamerV3ImageDecoder(in_features, shape, depth, mults, num_blocks=1))
+        return fast_norms(ImageDecoder(in_features, shape, depth, mults, num_blocks=1))
     return _ShiftedImage(ObsDecoder(depth, latent_dim=in_features, out_channels=channels))
 
 
@@ -126,6 +127,19 @@ def _check_image_size(architecture: Architecture, image_size: int) -> None:
             f"a CNN of {stages} stages halves the image {stages} times, which an image of {image_size} x "
             f"{image_size} pixels does not allow; use a multiple of {2**stages}"
         )
+
+
+class ImageDecoder(DreamerV3ImageDecoder):
+    """TorchRL's decoder, which adds the middle of the range in its last layer instead of to each pixel."""
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Images ``[..., C, H, W]`` of latents."""
+        latent = torch.cat(inputs, -1)
+        hidden = self.projection(latent.flatten(0, -2)).unflatten(-1, self.initial_shape)
+        hidden = self.layers[:-1](silu(self.projection_norm(hidden)))
+        last = self.layers[-1]
+        image = conv_transpose2d(hidden, last.weight, last.bias + 0.5, last.stride, last.padding, last.output_padding)
+        return image.unflatten(0, latent.shape[:-1])
 
 
 class _ScaledImage(nn.Module):

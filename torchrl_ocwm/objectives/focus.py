@@ -20,7 +20,7 @@ PositionalGradient = Literal["encoder", "latent", "both"]
 
 
 def instance_masks(masks: Tensor) -> Tensor:
-    """Masks of objects and background that share the pixels out: each belongs to its first object, or to none.
+    """Masks of objects and background that share the pixels out: each belongs to its first object, or to none of them.
 
     Args:
         masks: ``[..., O, H, W]`` bool, or integers that are 0 outside.
@@ -34,9 +34,12 @@ def instance_masks(masks: Tensor) -> Tensor:
                 [0, 0, 0],
                 [0, 0, 1]], dtype=torch.int32)
     """
-    masks = flags(masks, "masks")
-    taken = masks.cumsum(-3) - masks.long() > 0
-    return torch.cat([masks & ~taken, ~masks.any(-3, keepdim=True)], -3)
+    first, *others = flags(masks, "masks").unbind(-3)
+    instances, free = [first], ~first
+    for mask in others:
+        instances.append(mask & free)
+        free = free & ~mask
+    return torch.stack([*instances, free], -3)
 
 
 def mask_nll(mask_logits: Tensor, masks: Tensor) -> Tensor:
@@ -68,11 +71,11 @@ def object_reconstruction(colours: Tensor, pixels: Tensor, masks: Tensor) -> Ten
         >>> object_reconstruction(colours, pixels, torch.tensor([[[[True, False]]]]))
         tensor(3.7500)
     """
-    true = instance_masks(masks)
-    # No pixel belongs to two instances, so that one squared error per pixel is enough.
-    predicted = (colours.float() * true.unsqueeze(-3)).sum(-4)
-    error = (predicted - unit_image(pixels) * true.any(-3).unsqueeze(-3)).square()
-    return error.sum((-3, -2, -1)).mean()
+    # Each pixel belongs to one instance, so that one squared error per pixel is enough.
+    *objects, predicted = colours.float().unbind(-4)
+    for colour, mask in zip(objects, instance_masks(masks).unbind(-3), strict=False):
+        predicted = torch.where(mask.unsqueeze(-3), colour, predicted)
+    return (predicted - unit_image(pixels)).square().sum((-3, -2, -1)).mean()
 
 
 def positional_latent_loss(

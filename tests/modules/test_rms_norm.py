@@ -1,0 +1,53 @@
+"""RMS normalisation in a few operations gives what PyTorch's does, forward and backward."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.nn.functional import rms_norm
+from torchrl.modules import DreamerV3ImageEncoder, DreamerV3MLP
+
+from torchrl_ocwm.modules.rms_norm import RMSNorm, fast_norms
+
+
+@pytest.mark.parametrize(("shape", "dim"), [((7, 5), -1), ((2, 3, 5), -1), ((2, 5, 3, 4), -3)])
+def test_values_and_gradients_are_those_of_pytorch(shape: tuple[int, ...], dim: int) -> None:
+    features = shape[dim]
+    norm = RMSNorm(torch.nn.Parameter(torch.rand(features)), eps=0.1, dim=dim)
+    value = torch.randn(shape, requires_grad=True)
+    slow = value.detach().double().requires_grad_()
+    weight = norm.weight.detach().double().requires_grad_()
+    expected = rms_norm(slow.movedim(dim, -1), (features,), weight, 0.1).movedim(-1, dim)
+    got, gradient = norm(value), torch.randn(shape)
+    torch.testing.assert_close(got, expected.float())
+    got.backward(gradient)
+    expected.backward(gradient.double())
+    torch.testing.assert_close(value.grad, slow.grad.float())
+    torch.testing.assert_close(norm.weight.grad, weight.grad.float())
+
+
+def test_calculates_in_float32() -> None:
+    norm = RMSNorm(torch.nn.Parameter(torch.ones(2)))
+    large = torch.tensor([[300.0, 400.0]], dtype=torch.float16, requires_grad=True)  # its square is not a float16
+    got = norm(large)
+    assert got.dtype == torch.float16
+    torch.testing.assert_close(got.float(), torch.tensor([[0.8485, 1.1314]]), rtol=1e-3, atol=0)
+    got.sum().backward()
+    assert large.grad.dtype == torch.float16
+
+
+@pytest.mark.parametrize(
+    ("network", "value"),
+    [
+        (DreamerV3MLP(4, 3, depth=2, num_cells=8), torch.randn(5, 4)),
+        (DreamerV3ImageEncoder(3, 4, (1, 2)), torch.rand(2, 3, 8, 8)),
+    ],
+)
+def test_replaces_all_norms_of_a_network_and_keeps_its_parameters(
+    network: torch.nn.Module, value: torch.Tensor
+) -> None:
+    expected, names = network(value), [name for name, _ in network.named_parameters()]
+    torch.testing.assert_close(fast_norms(network)(value), expected)
+    assert [name for name, _ in network.named_parameters()] == names
+    norms = [type(module) for module in network.modules() if "RMSNorm" in type(module).__name__]
+    assert norms == [RMSNorm, RMSNorm]
