@@ -59,7 +59,7 @@ def test_every_size_builds(name: str) -> None:
     assert agent.model.state == architecture.categoricals * architecture.classes
 
 
-V3 = {"DreamerV3MLP", "DreamerV3ImageEncoder", "DreamerV3ImageDecoder", "_DreamerV3BlockGRU", "_DreamerV3RMSNorm"}
+V3 = {"DreamerV3MLP", "DreamerV3ImageEncoder", "ImageDecoder", "BlockGRU", "RMSNorm"}
 V2 = {"MLP", "ObsEncoder", "ObsDecoder", "GRUCell", "ELU"}
 
 

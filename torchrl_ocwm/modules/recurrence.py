@@ -166,7 +166,8 @@ class BlockGRU(nn.Module):
         for layer in others:
             hidden = layer(hidden)
         reset, candidate, update = torch.baddbmm(bias, self._blocks(hidden), self.gates.weight).chunk(3, -1)
-        after = torch.lerp(blocks, (reset.sigmoid() * candidate).tanh(), update.sigmoid())
+        candidate = (reset.sigmoid() * candidate).tanh()
+        after = torch.lerp(blocks, candidate.to(blocks.dtype), update.sigmoid().to(blocks.dtype))
         return after.transpose(0, 1).reshape(belief.shape)
 
     def _blocks(self, features: Tensor) -> Tensor:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock
 from tensordict import TensorDictBase
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
@@ -31,6 +33,15 @@ def one_graph() -> AbstractContextManager[None]:
     return dynamo.patch(trace_autograd_ops=True) if known else nullcontext()
 
 
+def one_at_a_time() -> FileLock:
+    """Where processes compile for themselves, one after the other: two that write one cache have crashed."""
+    from torch._inductor.runtime.cache_dir_utils import cache_dir  # takes seconds to import
+
+    folder = Path(cache_dir())
+    folder.mkdir(parents=True, exist_ok=True)
+    return FileLock(folder / "torchrl_ocwm.lock")
+
+
 class Stepper(DreamerV3OptimizationStepper):
     """TorchRL's DreamerV3 stepper with mixed precision on CPUs too, and nothing in the step that breaks its graph."""
 
@@ -46,9 +57,11 @@ class Stepper(DreamerV3OptimizationStepper):
 
     def warmup(self, sample: TensorDictBase) -> None:
         """Compile or capture the step on representative data; nothing is trained."""
-        on_cpu = sample.get("action").device.type == "cpu"
+        device = sample.get("action").device
+        compiles, _ = self.resolve(device)
         # Inductor's C++ for both passes in bfloat16 declares a variable twice (PyTorch 2.13); apart, they compile.
-        with nullcontext() if on_cpu and self.mixed_precision else one_graph():
+        graph = nullcontext() if device.type == "cpu" and self.mixed_precision else one_graph()
+        with graph, one_at_a_time() if compiles else nullcontext():
             super().warmup(sample)
 
     def step(self, trainer: Trainer | None, sub_batch: TensorDictBase) -> TensorDictBase:
