@@ -21,14 +21,16 @@ from torchrl_ocwm.data import Collection, SmoothRandomPolicy, collect
 from torchrl_ocwm.envs import Task, make_task
 from torchrl_ocwm.evaluation import (
     EvaluationEnvs,
+    Footage,
     LandmarkEvaluation,
     ReconstructionError,
     episode_records,
+    episodes,
     goal_images,
     transition,
 )
 from torchrl_ocwm.evaluation.episodes import SteppedEnvs
-from torchrl_ocwm.processes import WorkerError
+from torchrl_ocwm.processes import LocalWorker, WorkerError
 from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.testing import random_records, reacher_task
 
@@ -101,6 +103,55 @@ def test_some_goals_again(envs: EvaluationEnvs, task: Task) -> None:
     chosen = torch.tensor([1, 4])
     again = envs.run(Drawing(), goals(task, 6)[chosen], seed=3, numbers=chosen)
     torch.testing.assert_close(again["object_position_true"], all_of_them["object_position_true"][chosen])
+
+
+def test_blind_episodes_are_the_same_and_nothing_is_rendered(
+    envs: EvaluationEnvs, task: Task, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeing = envs.run(Drawing(), goals(task, 6), seed=3)
+    with monkeypatch.context() as patch:
+        patch.delattr("torchrl_ocwm.envs.Camera.render")
+        blind = envs.run(Drawing(), goals(task, 6), seed=3, blind=True)
+    assert set(blind.keys()) == {"object_position_true", "goal_position"}
+    torch.testing.assert_close(blind["object_position_true"], seeing["object_position_true"], rtol=0, atol=0)
+    again = envs.run(Drawing(), goals(task, 6), seed=3, keep=("pixels",))  # it is not blind for ever
+    assert again["pixels"].flatten(1).any(1).all()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_goals_are_spread_over_all_processes(task: Task, workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also when one of them had room for all."""
+    counts: list[int] = []
+    monkeypatch.setattr(episodes, "make_worker", lambda make, **_: LocalWorker(make))
+    reset = SteppedEnvs.reset
+
+    def note(self: SteppedEnvs, starts: list[Any], blind: bool = False) -> TensorDictBase:
+        counts.append(len(starts))
+        return reset(self, starts, blind)
+
+    monkeypatch.setattr(SteppedEnvs, "reset", note)
+    with EvaluationEnvs(task, episode_steps=1, workers=workers, envs=4) as envs:
+        envs.run(push, goals(task, 3))
+    assert counts == ([2, 1] if workers else [3])
+
+
+def test_footage_is_of_the_episodes_that_are_run(envs: EvaluationEnvs, task: Task) -> None:
+    """Of goals in different batches, and in the order of the goals."""
+    agent, chosen = build_agent("focus_lcp", task, "debug"), torch.tensor([1, 2, 5])
+    footage, steps = Footage(chosen), []
+
+    def inspect(step: TensorDictBase) -> dict[str, Any]:
+        footage(step)
+        steps.append(step["latent"].clone())
+        return transition(step)
+
+    played = envs.run(agent.policy(), goals(task, 6), seed=3, inspect=inspect)
+    kept = footage.episodes()
+    assert kept.shape == (3, 5)
+    for key in ("pixels", ("next", "pixels"), ("next", "object_position")):
+        assert torch.equal(kept["transition"][key], played["transition"][key][chosen])
+    states = torch.cat([torch.stack([one["state"] for one in batch], 1) for batch in (steps[:5], steps[5:])])
+    assert torch.equal(kept["latent", "state"], states[chosen])
 
 
 def test_starts_are_not_those_of_collecting(task: Task, tmp_path: Path) -> None:
