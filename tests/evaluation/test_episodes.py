@@ -190,13 +190,13 @@ def test_closing_closes_every_environment() -> None:
     closed = []
 
     class Stub:
-        def reset(self) -> TensorDictBase:
-            return TensorDict({"observation": torch.zeros(1)})
+        def reset(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+            return {"observation": np.zeros(1)}, {}
 
         def close(self) -> None:
             closed.append(self)
 
-    envs = SteppedEnvs(Stub, lambda: None)  # type: ignore[arg-type]
+    envs = SteppedEnvs(Stub, lambda: None)
     assert envs.reset([{}, {}]).shape == (2,)
     made = list(envs.envs)
     envs.close()

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from math import ceil
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
-from torchrl_ocwm.envs import Task, find_environment, make_env, make_scene
+from torchrl_ocwm.envs import Task, find_environment, make_scene
 from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.evaluation.randomness import EpisodeRandomness
@@ -27,6 +27,7 @@ with needs("an evaluation", "recipes"):
     from tqdm import tqdm
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
+Observation = dict[str, np.ndarray]
 Inspect = Callable[[TensorDictBase], dict[str, Any]]
 _TRUE = ("object_position_true",)
 _KEPT = ("object_position", *_TRUE, "reward")
@@ -36,14 +37,16 @@ _SEEN = ("pixels", "masks", "proprio", "object_position", "object_visible", "goa
 class SteppedEnvs:
     """Environments that are stepped one after the other, made when they are first needed.
 
+    They are gymnasium's: what TorchRL adds to a single step of a single environment takes longer than its physics.
+
     Args:
         make: Makes one.
         alive: Called after each step.
     """
 
-    def __init__(self, make: Callable[[], EnvBase], alive: Callable[[], None]) -> None:
+    def __init__(self, make: Callable[[], Any], alive: Callable[[], None]) -> None:
         self.make, self.alive = make, alive
-        self.envs: list[EnvBase] = []
+        self.envs: list[Any] = []
         self._dropped: tuple[str, ...] = ()
 
     def reset(self, starts: list[dict[str, Any]], blind: bool = False) -> TensorDictBase:
@@ -58,28 +61,31 @@ class SteppedEnvs:
             self.envs.append(self.make())
             self.alive()
         self._dropped = ("pixels", "masks") if blind else ()
-
-        def one(index: int) -> TensorDictBase:
-            if isinstance(env := self.envs[index], TransformedEnv):
-                env.base_env._env.unwrapped.blind = blind
-            return env.reset(**starts[index])
-
-        return self._all(one, len(starts))
+        observations = []
+        for env, start in zip(self.envs, starts, strict=False):
+            env.blind = blind
+            observations.append(env.reset(**start)[0])
+            self.alive()
+        return self._batch(observations, is_init=True)
 
     def step(self, actions: Tensor) -> TensorDictBase:
         """Do the actions ``[E, A]``; what comes next ``[E]``."""
-
-        def one(index: int) -> TensorDictBase:
-            return self.envs[index].step(TensorDict({"action": actions[index]}))["next"]
-
-        return self._all(one, len(actions))
-
-    def _all(self, call: Callable[[int], TensorDictBase], number: int) -> TensorDictBase:
         results = []
-        for index in range(number):
-            results.append(call(index).exclude(*self._dropped))
+        for env, action in zip(self.envs, actions.numpy(), strict=False):
+            results.append(env.step(action))
             self.alive()
-        return torch.stack(results)
+        observations, rewards, terminated, truncated, _ = zip(*results, strict=True)
+        ends = torch.tensor([terminated, truncated]).unsqueeze(-1)
+        next_ = self._batch(
+            observations, is_init=False, reward=torch.tensor(rewards, dtype=torch.float32).unsqueeze(-1)
+        )
+        return next_.update({"terminated": ends[0], "truncated": ends[1], "done": ends.any(0)})
+
+    def _batch(self, observations: Sequence[Observation], *, is_init: bool, **more: Tensor) -> TensorDictBase:
+        keys = [key for key in observations[0] if key not in self._dropped]
+        seen = {key: torch.from_numpy(np.stack([one[key] for one in observations])) for key in keys}
+        begins = torch.full((len(observations), 1), is_init)
+        return TensorDict({**seen, "is_init": begins, **more}, [len(observations)])
 
     def close(self) -> None:
         """Close the environments."""
@@ -105,7 +111,7 @@ class EvaluationEnvs:
     ) -> None:
         self.task, self.episode_steps, self.envs = task, episode_steps, envs
         options = {**task.options, "horizon": episode_steps, "privileged": True}
-        make = partial(SteppedEnvs, partial(make_env, find_environment(task.name), **options))
+        make = partial(SteppedEnvs, partial(make_scene, find_environment(task.name), **options))
         self._workers: list[Worker] = []
         try:
             for _ in range(max(workers, 1)):
