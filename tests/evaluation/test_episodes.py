@@ -321,6 +321,26 @@ def test_landmarks(task: Task) -> None:
         LandmarkEvaluation(agent, episodes=11, episode_steps=3)
 
 
+@pytest.mark.parametrize("name", ["dreamer_pcp", "lexa_temporal"])
+def test_landmarks_beside_training(task: Task, name: str) -> None:
+    """A copy of the weights of that moment; the same scores, and no random number of training is drawn."""
+    agent = build_agent(name, task, "debug")
+    with (
+        LandmarkEvaluation(agent, episodes=2, episode_steps=3, beside=True) as beside,
+        LandmarkEvaluation(agent, episodes=2, episode_steps=3) as here,
+    ):
+        before = torch.random.get_rng_state()
+        first = here(0)
+        later: Any = beside(0)
+        torch.nn.init.normal_(next(agent.actor.parameters()))  # an update
+        assert later.answer() == first
+        assert here(1) != first
+        torch.random.set_rng_state(before)
+        assert beside(1).answer() == here(1)  # type: ignore[union-attr]
+        assert torch.equal(torch.random.get_rng_state(), before)
+    assert not multiprocessing.active_children()
+
+
 def test_landmarks_are_given_as_images_to_agents_that_take_nothing_else(task: Task) -> None:
     agent, seen = build_agent("lexa_temporal", task, size="debug"), []
     with LandmarkEvaluation(agent, episodes=2, episode_steps=2) as evaluation:
