@@ -1,11 +1,13 @@
-"""Evaluations that go on beside the updates, in runs; TestBeside in tests/evaluation has the real ones."""
+"""Evaluations that go on beside the updates, in runs."""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +16,13 @@ import torch
 
 from torchrl_ocwm.agents import SIZES, Agent, build_agent
 from torchrl_ocwm.data import EpisodeDataset
+from torchrl_ocwm.envs import make_task
+from torchrl_ocwm.evaluation import LandmarkEvaluation
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_dataset, reacher_task
 from torchrl_ocwm.training import cores
 from torchrl_ocwm.training.cores import evaluates_beside, update_threads
-from torchrl_ocwm.training.evaluations import EvaluationError
+from torchrl_ocwm.training.evaluations import EvaluationError, Later
 from torchrl_ocwm.training.hooks import UpdateClock
 from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.settings import Training
@@ -146,6 +150,33 @@ def test_a_signal_does_not_wait(dataset: EpisodeDataset, tmp_path: Path, at_end:
     )
     assert time.monotonic() - start < 300
     assert not (tmp_path / "log" / "scalars" / "evaluation").exists()
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_process_that_evaluates(tmp_path: Path, killed: bool) -> None:
+    """Training is as without it, and outlives it."""
+    task = make_task("reacher")
+    dataset = random_dataset(tmp_path / "data", task)
+    training = replace(SHORT, updates=6, eval_interval=2, checkpoint_interval=100)
+    alone, watched = (build_agent("focus_lcp", task, "debug") for _ in range(2))
+    watched.load_state_dict(alone.state_dict())
+    train_offline(alone, dataset, tmp_path / "alone", training, progress=False)
+    with LandmarkEvaluation(watched, episodes=2, episode_steps=3, beside=True) as evaluation:
+
+        def evaluate(updates: int) -> dict[str, float] | Later:
+            if killed and updates == 4:
+                [child] = multiprocessing.active_children()
+                child.kill()
+            return evaluation(updates)
+
+        with pytest.raises(EvaluationError, match="SIGKILL") if killed else nullcontext():
+            train_offline(watched, dataset, tmp_path / "watched", training, evaluate=evaluate, progress=False)
+    rows = (tmp_path / "watched" / "log" / "scalars" / "evaluation" / "success.csv").read_text().split()
+    assert [row.partition(",")[0] for row in rows] == (["2"] if killed else ["2", "4", "6"])
+    if killed:
+        train_offline(watched, dataset, tmp_path / "watched", training, progress=False)
+    for one, other in zip(alone.state_dict().values(), watched.state_dict().values(), strict=True):
+        assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize(("units", "threads"), [(16, 1), (128, 1), (256, 0)])
