@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 DEMO := outputs/demo
-# Updates of the demonstration; with 50,000 steps of data they fit in 15 minutes on two cores.
+# Updates of the demonstration. With 50,000 steps of data, all of it takes less than half an hour on two cores.
 UPDATES ?= 1500
 STEPS ?= 50000
 WORKERS := 2

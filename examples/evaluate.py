@@ -9,7 +9,6 @@ import json
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from torchrl_ocwm.envs import Task, find_environment, make_scene
 from torchrl_ocwm.evaluation import (
     Evaluation,
     EvaluationEnvs,
+    Footage,
     ReconstructionError,
     Report,
     check_ffmpeg,
@@ -41,7 +41,6 @@ from torchrl_ocwm.evaluation import (
     object_errors,
     picture_objects,
     tile,
-    transition,
     write_video,
 )
 from torchrl_ocwm.modules import ObjectWorldModel
@@ -97,6 +96,8 @@ def main(config: Evaluate) -> None:
         images = goal_images(task, goals, object_index=about)
     report = _report(goals, settings, config.include, {"object": task.objects[about]} if about else {})
     runs = _runs(files, policies, report)
+    chosen = torch.linspace(0, len(goals) - 1, min(settings.video_goals, settings.goals)).round().long()
+    footage: dict[str, Footage] = {}
     with EvaluationEnvs(
         task,
         episode_steps=settings.episode_steps,
@@ -105,24 +106,24 @@ def main(config: Evaluate) -> None:
         timeout=settings.timeout,
     ) as envs:
         if settings.random and "random" not in report.rows:
-            played = envs.run(SmoothRandomPolicy(task.action), goals, seed=settings.seed, progress=True)
+            played = envs.run(SmoothRandomPolicy(task.action), goals, seed=settings.seed, blind=True, progress=True)
             report.add("random", measure(played, object_index=about), source="smooth actions")
         for policy, run in zip(policies, runs, strict=True):
             name = agent_name(policy.agent.config) + (f", {settings.behaviour}" if settings.behaviour else "")
             for kind in _goal_kinds(policy, settings.image_goals):
-                scores = _evaluate(policy, envs, goals, settings.seed, images if kind == IMAGE_GOALS else None)
+                seen = images if kind == IMAGE_GOALS else None
+                footage[kind] = Footage(chosen)  # in the end that of the last policy
+                scores = _evaluate(policy, envs, goals, settings.seed, seen, footage[kind])
                 report.add(name + kind, scores, **run)
-        report.save(output)
-        print(report.markdown())
-        _draw(report, task, output)
-        if settings.video_goals:
-            chosen = torch.linspace(0, len(goals) - 1, min(settings.video_goals, settings.goals)).round().long()
-            film = partial(_film, policies[-1], envs, goals, chosen, settings.seed)
-            films = [
-                film(output / FILMS[kind], images if kind == IMAGE_GOALS else None)
-                for kind in _goal_kinds(policies[-1], settings.image_goals)
-            ]
-            _picture_objects(policies[-1].agent, films[0], output)
+    report.save(output)
+    print(report.markdown())
+    _draw(report, task, output)
+    if settings.video_goals:
+        films = {kind: footage[kind].episodes() for kind in _goal_kinds(policies[-1], settings.image_goals)}
+        for kind, episodes in films.items():
+            seen = images[chosen] if images is not None and kind == IMAGE_GOALS else None
+            _film(policies[-1], episodes, goals[chosen], settings.seed, output / FILMS[kind], seen)
+        _picture_objects(policies[-1].agent, next(iter(films.values())), output)
     print(f"\ntable, numbers, heatmap, learning curve, videos: {output}")
 
 
@@ -184,11 +185,12 @@ def _folders(sources: list[str]) -> list[Path]:
 
 
 def _evaluate(
-    policy: Policy, envs: EvaluationEnvs, goals: Tensor, seed: int, images: Tensor | None = None
+    policy: Policy, envs: EvaluationEnvs, goals: Tensor, seed: int, images: Tensor | None, footage: Footage
 ) -> dict[str, Tensor]:
     reconstruct = ReconstructionError(policy.agent, object_index=policy.object_index)
 
     def inspect(step: TensorDictBase) -> dict[str, Tensor | TensorDictBase]:
+        footage(step)
         return {**reconstruct(step), "latent": step["latent"].select("state", "belief", "goal", strict=False)}
 
     episodes = envs.run(policy, goals, images=images, seed=seed, inspect=inspect, progress=True)
@@ -206,27 +208,15 @@ def _evaluate(
 
 
 def _film(
-    policy: Policy,
-    envs: EvaluationEnvs,
-    goals: Tensor,
-    chosen: Tensor,
-    seed: int,
-    file: Path,
-    images: Tensor | None = None,
-) -> TensorDictBase:
-    """The episodes of a few goals, as they were scored: what happened, the goal as a cross.
+    policy: Policy, episodes: TensorDictBase, goals: Tensor, seed: int, file: Path, images: Tensor | None = None
+) -> None:
+    """A few of the episodes that were scored: what happened, the goal as a cross.
 
     Below, what the agent imagined would happen, from the first frame.
     Above both the goal image, where the agent was given one.
     """
-    task, goals = policy.agent.task, goals[chosen]
-    images = None if images is None else images[chosen]
-
-    def inspect(step: TensorDictBase) -> dict[str, TensorDictBase]:
-        return {"latent": step["latent"], **transition(step)}
-
-    episodes = envs.run(policy, goals, images=images, seed=seed, numbers=chosen, inspect=inspect)
-    latents = imagined_rollout(policy.behaviour, episodes["latent"][:, 0], envs.episode_steps, seed=seed)["latent"]
+    task = policy.agent.task
+    latents = imagined_rollout(policy.behaviour, episodes["latent"][:, 0], episodes.shape[1], seed=seed)["latent"]
     imagined = decode_video(policy.agent.model, latents)
     with closing(make_scene(find_environment(task.name), **task.options)) as scene:
         points = torch.as_tensor(scene.project(goals.numpy()))
@@ -234,7 +224,6 @@ def _film(
     if images is not None:
         rows.insert(0, images.unsqueeze(1).expand_as(rows[0]))
     write_video(file, tile(rows))
-    return episodes
 
 
 def _picture_objects(agent: Agent, episodes: TensorDictBase, output: Path) -> None:

@@ -20,7 +20,7 @@ from torchrl_ocwm.envs import EnvChoice
 from torchrl_ocwm.evaluation import LandmarkEvaluation, OpenLoopFilm
 from torchrl_ocwm.recipes import keep_settings, recipe, run_folder
 from torchrl_ocwm.settings import Settings
-from torchrl_ocwm.training import Training, check_memory, train_offline
+from torchrl_ocwm.training import Training, check_memory, evaluates_beside, train_offline
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,12 @@ def main(config: TrainOffline) -> None:
     with ExitStack() as stack:
         if training.eval_interval:
             evaluation = stack.enter_context(
-                LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps)
+                LandmarkEvaluation(
+                    agent,
+                    episodes=training.eval_episodes,
+                    episode_steps=training.eval_steps,
+                    beside=evaluates_beside(training, config.size),
+                )
             )
         if training.video_interval:
             film = OpenLoopFilm(agent, dataset, folder / "videos")

@@ -22,7 +22,7 @@ from torchrl_ocwm.evaluation import LandmarkEvaluation, OpenLoopFilm, check_ffmp
 from torchrl_ocwm.recipes import keep_settings, recipe, run_folder
 from torchrl_ocwm.settings import Settings
 from torchrl_ocwm.signals import ended_by_signals
-from torchrl_ocwm.training import Online, Training, check_memory, collect_seed_steps, train_online
+from torchrl_ocwm.training import Online, Training, check_memory, collect_seed_steps, evaluates_beside, train_online
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,12 @@ def main(config: TrainOnline) -> None:
         # Each checks whether it can do its work before any is done.
         if training.eval_interval:
             evaluation = stack.enter_context(
-                LandmarkEvaluation(agent, episodes=training.eval_episodes, episode_steps=training.eval_steps)
+                LandmarkEvaluation(
+                    agent,
+                    episodes=training.eval_episodes,
+                    episode_steps=training.eval_steps,
+                    beside=evaluates_beside(training, config.size),
+                )
             )
         if training.video_interval:
             check_ffmpeg("training.video_interval")

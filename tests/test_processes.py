@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -21,7 +22,7 @@ class OddError(Exception):
 
 class Counter:
     def __init__(self, alive: Callable[[], None]) -> None:
-        self.total = 0
+        self.total, self.alive = 0, alive
 
     def add(self, number: int) -> int:
         self.total += number
@@ -29,6 +30,13 @@ class Counter:
 
     def large(self, size: int) -> torch.Tensor:
         return torch.arange(size)
+
+    def slow(self, seconds: float) -> str:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.alive()
+            time.sleep(0.05)
+        return "at last"
 
     def fail(self, odd: bool) -> None:
         raise OddError(3, "times") if odd else KeyError("there")
@@ -76,5 +84,54 @@ def test_requests_to_the_dead_do_not_raise() -> None:
     worker._process.join()
     worker.request("add", 1)
     with pytest.raises(WorkerError, match=r"has ended \(signal SIGKILL\)"):
+        worker.answer()
+    worker.close()
+
+
+def test_done_is_said_without_waiting() -> None:
+    """Whatever has arrived before: signs of life, parts of the answer, or nothing."""
+    worker = make_worker(Counter, process=True, timeout=60)
+    worker.ready()
+    for _ in range(2):
+        worker.request("slow", 1.5)  # with a sign of life on the way
+        start, asked = time.monotonic(), 0
+        while not worker.done():
+            asked += 1
+            assert time.monotonic() - start < 60
+            time.sleep(0.01)
+        assert asked > 20
+        assert worker.answer() == "at last"
+    worker.request("large", 1_000_000)
+    assert torch.equal(worker.answer(), torch.arange(1_000_000))
+    worker.close()
+    assert worker.done()
+
+
+def test_signs_of_life_and_answer_that_arrive_together() -> None:
+    worker = make_worker(Counter, process=True, timeout=60)
+    worker.ready()
+    worker.request("slow", 1.5)
+    time.sleep(4)
+    until = time.monotonic() + 60
+    while not worker.done():
+        assert time.monotonic() < until
+    worker.request("add", 2)
+    assert worker.answer() == "at last"
+    assert worker.answer() == 2
+    worker.close()
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_call_that_fails_is_done(ends: bool) -> None:
+    worker: Any = make_worker(Counter, process=True, timeout=60)
+    worker.ready()
+    worker.request("slow", 60) if ends else worker.request("fail", False)
+    if ends:
+        assert not worker.done()
+        worker._process.kill()
+    until = time.monotonic() + 30
+    while not worker.done():
+        assert time.monotonic() < until
+    with pytest.raises(WorkerError if ends else KeyError):
         worker.answer()
     worker.close()

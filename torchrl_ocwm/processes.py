@@ -12,6 +12,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from multiprocessing.connection import wait
 from typing import Any, Protocol
 
 import cloudpickle
@@ -37,6 +38,9 @@ class Worker(Protocol):
 
     def request(self, method: str, *arguments: Any) -> None:
         """Begin a call."""
+
+    def done(self) -> bool:
+        """Whether the call has ended; :meth:`answer` then does not wait."""
 
     def answer(self) -> Any:
         """Wait for the result of the call, or raise what it raised."""
@@ -76,6 +80,10 @@ class LocalWorker:
         """Note the call; the answer does it."""
         self._call = method, arguments
 
+    def done(self) -> bool:
+        """The answer does the call."""
+        return True
+
     def answer(self) -> Any:
         """Call the method."""
         method, arguments = self._call
@@ -100,6 +108,7 @@ class ProcessWorker:
     def __init__(self, make: Make, timeout: float) -> None:
         ours, theirs = socket.socketpair()
         self._timeout, self._socket, self._answers = timeout, ours, ours.makefile("rb")
+        self._arrived: Any = _SIGN
         with theirs, interrupts_ignored():
             self._process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True)
             self._process.start()
@@ -126,12 +135,39 @@ class ProcessWorker:
         Raises:
             WorkerError: if the process has ended, or hangs.
         """
-        answer: Any = _SIGN
+        while self._arrived is _SIGN:
+            self._arrived = self._receive()
+        (result, error, there), self._arrived = self._arrived, _SIGN
+        if error is not None:
+            raise error from _ThereError(there)
+        return result
+
+    def done(self) -> bool:
+        """Whether :meth:`answer` would return or raise at once. A process that hangs is noticed by that only."""
+        try:
+            while self._arrived is _SIGN and self._is_arriving():
+                self._arrived = self._receive()
+        except WorkerError:
+            return True
+        return self._arrived is not _SIGN
+
+    def _is_arriving(self) -> bool:
+        if self._socket.fileno() < 0 or wait([self._socket], 0):
+            return True
+        timeout = self._socket.gettimeout()
+        self._socket.settimeout(0)
+        try:
+            return bool(self._answers.peek(1))  # it has come together with the message before
+        except OSError:  # the process has just ended
+            return True
+        finally:
+            self._socket.settimeout(timeout)
+
+    def _receive(self) -> Any:
         if self._socket.fileno() < 0:
             raise WorkerError("the process was closed")
         try:
-            while answer is _SIGN:
-                answer = pickle.load(self._answers)
+            return pickle.load(self._answers)
         except TimeoutError:
             raise WorkerError(
                 f"process {self._process.pid} has given no sign of life for {self._socket.gettimeout():g} seconds"
@@ -139,10 +175,6 @@ class ProcessWorker:
         except (EOFError, OSError, pickle.UnpicklingError):
             self._process.join(1)
             raise WorkerError(f"process {self._process.pid} has ended ({_how(self._process.exitcode)})") from None
-        result, error, there = answer
-        if error is not None:
-            raise error from _ThereError(there)
-        return result
 
     def close(self) -> None:
         """Kill the process. It keeps nothing that would have to be written, and may hang."""

@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from torchrl_ocwm.agents import AGENTS, Agent, Behaviour, build_agent
 from torchrl_ocwm.data import Collection, EpisodeDataset, collect
 from torchrl_ocwm.envs import Task
-from torchrl_ocwm.evaluation import LandmarkEvaluation, goal_images, measure, normalized_score
+from torchrl_ocwm.evaluation import EvaluationEnvs, LandmarkEvaluation, goal_images, measure, normalized_score
 from torchrl_ocwm.modules import UnitRMS
 from torchrl_ocwm.settings import SettingsError, change
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
@@ -147,8 +147,9 @@ def test_agents_for_either_of_two_cubes(index: int, dataset: EpisodeDataset, tmp
     with LandmarkEvaluation(agent, episodes=1, episode_steps=2) as evaluation:
         keep = lambda updates: scores.append(evaluation(updates)) or scores[-1]  # noqa: E731
         train_offline(agent, dataset, tmp_path, training, evaluate=keep, progress=False)
-        goals = torch.tensor(task.workspace.landmarks[:1])
-        episodes = evaluation.envs.run(agent.eval().policy(), goals)
+    goals = torch.tensor(task.workspace.landmarks[:1])
+    with EvaluationEnvs(task, episode_steps=2, workers=0, envs=1) as envs:
+        episodes = envs.run(agent.eval().policy(), goals)
     true = episodes["object_position_true"]
     assert (true[:, 0, 0] - true[:, 0, 1]).norm(dim=-1).min() > 0.02  # the cubes are at different places
     expected = [float(normalized_score(true[:, -1, one], goals).mean()) for one in (0, 1)]

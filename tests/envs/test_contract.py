@@ -397,6 +397,22 @@ def test_hidden_object_keeps_its_last_position(env: PositioningEnv, case: Case, 
     assert error(again) < case.error
 
 
+def test_blind_steps_lead_to_the_same_places_and_show_nothing(env: PositioningEnv, twin: PositioningEnv) -> None:
+    env.blind = True
+    try:
+        for one in (env, twin):
+            one.reset(seed=3)
+        action = np.full(env.action_space.shape, 0.5, np.float32)
+        (blind, *_), (seeing, *_) = env.step(action), twin.step(action)
+        assert np.array_equal(env.true_position(), twin.true_position())
+        assert np.array_equal(blind["proprio"], seeing["proprio"])
+        assert seeing["pixels"].any()
+        assert env.observation_space.contains(blind)
+        assert not any(blind[key].any() for key in ("pixels", "masks", "object_visible", "object_position"))
+    finally:
+        env.blind = False
+
+
 def test_hidden_from_the_start_is_zero(env: PositioningEnv, hide: Callable[..., None]) -> None:
     env.reset(seed=15)
     env.step(still(env))

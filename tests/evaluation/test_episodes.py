@@ -21,14 +21,16 @@ from torchrl_ocwm.data import Collection, SmoothRandomPolicy, collect
 from torchrl_ocwm.envs import Task, make_task
 from torchrl_ocwm.evaluation import (
     EvaluationEnvs,
+    Footage,
     LandmarkEvaluation,
     ReconstructionError,
     episode_records,
+    episodes,
     goal_images,
     transition,
 )
 from torchrl_ocwm.evaluation.episodes import SteppedEnvs
-from torchrl_ocwm.processes import WorkerError
+from torchrl_ocwm.processes import LocalWorker, WorkerError
 from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.testing import random_records, reacher_task
 
@@ -103,6 +105,55 @@ def test_some_goals_again(envs: EvaluationEnvs, task: Task) -> None:
     torch.testing.assert_close(again["object_position_true"], all_of_them["object_position_true"][chosen])
 
 
+def test_blind_episodes_are_the_same_and_nothing_is_rendered(
+    envs: EvaluationEnvs, task: Task, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeing = envs.run(Drawing(), goals(task, 6), seed=3)
+    with monkeypatch.context() as patch:
+        patch.delattr("torchrl_ocwm.envs.Camera.render")
+        blind = envs.run(Drawing(), goals(task, 6), seed=3, blind=True)
+    assert set(blind.keys()) == {"object_position_true", "goal_position"}
+    torch.testing.assert_close(blind["object_position_true"], seeing["object_position_true"], rtol=0, atol=0)
+    again = envs.run(Drawing(), goals(task, 6), seed=3, keep=("pixels",))  # it is not blind for ever
+    assert again["pixels"].flatten(1).any(1).all()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_goals_are_spread_over_all_processes(task: Task, workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also when one of them had room for all."""
+    counts: list[int] = []
+    monkeypatch.setattr(episodes, "make_worker", lambda make, **_: LocalWorker(make))
+    reset = SteppedEnvs.reset
+
+    def note(self: SteppedEnvs, starts: list[Any], blind: bool = False) -> TensorDictBase:
+        counts.append(len(starts))
+        return reset(self, starts, blind)
+
+    monkeypatch.setattr(SteppedEnvs, "reset", note)
+    with EvaluationEnvs(task, episode_steps=1, workers=workers, envs=4) as envs:
+        envs.run(push, goals(task, 3))
+    assert counts == ([2, 1] if workers else [3])
+
+
+def test_footage_is_of_the_episodes_that_are_run(envs: EvaluationEnvs, task: Task) -> None:
+    """Of goals in different batches, and in the order of the goals."""
+    agent, chosen = build_agent("focus_lcp", task, "debug"), torch.tensor([1, 2, 5])
+    footage, steps = Footage(chosen), []
+
+    def inspect(step: TensorDictBase) -> dict[str, Any]:
+        footage(step)
+        steps.append(step["latent"].clone())
+        return transition(step)
+
+    played = envs.run(agent.policy(), goals(task, 6), seed=3, inspect=inspect)
+    kept = footage.episodes()
+    assert kept.shape == (3, 5)
+    for key in ("pixels", ("next", "pixels"), ("next", "object_position")):
+        assert torch.equal(kept["transition"][key], played["transition"][key][chosen])
+    states = torch.cat([torch.stack([one["state"] for one in batch], 1) for batch in (steps[:5], steps[5:])])
+    assert torch.equal(kept["latent", "state"], states[chosen])
+
+
 def test_starts_are_not_those_of_collecting(task: Task, tmp_path: Path) -> None:
     options = {"horizon": 5}
     collected = collect(tmp_path / "d", "reacher", Collection(steps=30, workers=0), options=options, progress=False)
@@ -139,13 +190,13 @@ def test_closing_closes_every_environment() -> None:
     closed = []
 
     class Stub:
-        def reset(self) -> TensorDictBase:
-            return TensorDict({"observation": torch.zeros(1)})
+        def reset(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+            return {"observation": np.zeros(1)}, {}
 
         def close(self) -> None:
             closed.append(self)
 
-    envs = SteppedEnvs(Stub, lambda: None)  # type: ignore[arg-type]
+    envs = SteppedEnvs(Stub, lambda: None)
     assert envs.reset([{}, {}]).shape == (2,)
     made = list(envs.envs)
     envs.close()
@@ -268,6 +319,26 @@ def test_landmarks(task: Task) -> None:
     assert 0 < scores["evaluation/final_score"] < 1
     with pytest.raises(SettingsError, match="eval_episodes=11, but reacher has 10 landmark goals"):
         LandmarkEvaluation(agent, episodes=11, episode_steps=3)
+
+
+@pytest.mark.parametrize("name", ["dreamer_pcp", "lexa_temporal"])
+def test_landmarks_beside_training(task: Task, name: str) -> None:
+    """A copy of the weights of that moment; the same scores, and no random number of training is drawn."""
+    agent = build_agent(name, task, "debug")
+    with (
+        LandmarkEvaluation(agent, episodes=2, episode_steps=3, beside=True) as beside,
+        LandmarkEvaluation(agent, episodes=2, episode_steps=3) as here,
+    ):
+        before = torch.random.get_rng_state()
+        first = here(0)
+        later: Any = beside(0)
+        torch.nn.init.normal_(next(agent.actor.parameters()))  # an update
+        assert later.answer() == first
+        assert here(1) != first
+        torch.random.set_rng_state(before)
+        assert beside(1).answer() == here(1)  # type: ignore[union-attr]
+        assert torch.equal(torch.random.get_rng_state(), before)
+    assert not multiprocessing.active_children()
 
 
 def test_landmarks_are_given_as_images_to_agents_that_take_nothing_else(task: Task) -> None:

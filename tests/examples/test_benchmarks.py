@@ -13,6 +13,9 @@ from types import ModuleType
 import pytest
 import torch
 
+from torchrl_ocwm.agents import build_agent, save_agent
+from torchrl_ocwm.envs import make_task
+
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
@@ -125,3 +128,20 @@ def test_how_updates_are_timed(update_speed: ModuleType) -> None:
     update.stepper.step = lambda trainer, batch: calls.append(batch)
     update.round()
     assert len(calls) == 3
+
+
+def test_speed_of_an_evaluation_adds_up(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    file = save_agent(build_agent("focus_lcp", make_task("reacher"), "debug"), tmp_path / "agent.zip")
+    small = ["--goals", "1", "--steps", "6", "--rounds", "1", "--workers", "0"]
+    command = [sys.executable, str(BENCHMARKS / "evaluation_speed.py"), str(file), *small]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "1 goals, 6 steps, 0 processes; medians of 1 rounds" in done.stdout
+    _, _, *rows = cells(done.stdout)
+    seconds = {name: float(value) for name, value, *_ in rows}
+    total, _ = seconds.pop("**all**"), seconds.pop("**processor**")
+    assert sum(seconds.values()) == pytest.approx(total, abs=0.05 * (len(seconds) + 1))  # rounded numbers
+    shares = {name: float(share) for name, _, share in rows[:-2]}
+    assert all(0 <= share <= 1 for share in shares.values())
+    assert min(seconds["writing of videos"], seconds["everything else, such as imports"]) > 0

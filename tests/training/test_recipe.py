@@ -45,13 +45,14 @@ def children(of: int) -> set[int]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").exists(), reason="counts processes in /proc")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(("number", "beside"), [(signal.SIGINT, "true"), (signal.SIGTERM, "false")])
 def test_a_signal_ends_it_with_a_checkpoint_and_without_children(
-    dataset: EpisodeDataset, tmp_path: Path, number: int
+    dataset: EpisodeDataset, tmp_path: Path, number: int, beside: str
 ) -> None:
     """While it evaluates: that alone would take half an hour."""
     arguments = [f"output={tmp_path}", "size=debug", "training.log_interval=10000", "training.eval_interval=1"]
-    arguments += ["training.eval_steps=100000", "training.video_interval=0", "training.checkpoint_interval=1"]
+    arguments += [f"training.eval_beside={beside}", "training.eval_steps=100000"]
+    arguments += ["training.video_interval=0", "training.checkpoint_interval=1"]
     with subprocess.Popen(
         command(dataset, *arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -139,6 +140,7 @@ def test_threads(run: Callable[..., Run]) -> None:
     try:
         assert run(updates=1, threads=3).threads == [3]
         assert run(updates=1, threads=0).threads == [3]  # as it was
+        assert run(updates=1).threads == [1]  # as small networks have it
     finally:
         torch.set_num_threads(before)
 
@@ -254,7 +256,7 @@ def episodes(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
             self.settings = {"task": task, **settings}
 
         def run(self, policy: Any, goals: torch.Tensor, **images: Any) -> TensorDict:
-            seen.append({**self.settings, "goals": goals, "agent": policy.agent})
+            seen.append({**self.settings, "goals": goals})
             place = torch.zeros(len(goals), 2, 1, 2)
             return TensorDict({"object_position_true": place, "goal_position": torch.zeros(len(goals), 2, 2)})
 
@@ -281,10 +283,40 @@ def train(command: Callable[..., str], tmp_path: Path, dataset: EpisodeDataset) 
 @shows("Training.eval_episodes", "Training.eval_steps", "Workspace.landmarks")
 def test_evaluations_while_training(train: Callable[..., str], episodes: list[dict[str, Any]]) -> None:
     settings = ("training.eval_interval=1", "training.eval_episodes=3", "training.eval_steps=7")
+    settings += ("training.eval_beside=false",)
     assert "checkpoint: run/checkpoint.zip" in train(*settings, "output=run")
     assert len(episodes) == 2
     assert episodes[0]["episode_steps"] == 7
     torch.testing.assert_close(episodes[0]["goals"], torch.tensor(POINTS[:3]))
+
+
+@shows("Training.eval_beside")
+@pytest.mark.parametrize("beside", ["true", "false"])
+@pytest.mark.parametrize("script", ["train_offline", "train_online"])
+def test_evaluations_beside_training(
+    command: Callable[..., str],
+    scripts: dict[str, ModuleType],
+    monkeypatch: pytest.MonkeyPatch,
+    dataset: EpisodeDataset,
+    beside: str,
+    script: str,
+) -> None:
+    seen: list[Any] = []
+
+    def note(agent: Agent, **settings: Any) -> nullcontext[None]:
+        seen.append(settings["beside"])
+        return nullcontext()
+
+    monkeypatch.setattr(scripts[script], "LandmarkEvaluation", note)
+    monkeypatch.setattr(scripts[script], script, lambda *_, **__: Path("run", "checkpoint.zip"))
+    if script == "train_online":
+        monkeypatch.setattr(scripts[script], "collect_seed_steps", lambda *_, **__: dataset)
+        monkeypatch.setattr(scripts[script], "make_task", lambda *_, **__: TASK)
+        monkeypatch.setattr(scripts[script], "with_coverage", lambda *_: None)
+    else:
+        monkeypatch.setattr(EpisodeDataset, "open", lambda *_, **__: dataset)
+    command(script, f"training.eval_beside={beside}", "training.video_interval=0", "size=debug", "output=run")
+    assert seen == [beside == "true"]
 
 
 @shows(

@@ -26,6 +26,7 @@ TARGET_COLOUR = (230, 40, 40)
 _FARTHEST = 100  # times the size of the model; nothing gets there but by a jump
 
 Observation = dict[str, np.ndarray]
+_Seen = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # pixels, masks, positions, which objects are visible
 
 
 class SimulationDivergedError(UserError, RuntimeError):
@@ -63,6 +64,10 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         privileged: Add ``object_position_true`` to the observations.
         render_mode: ``"rgb_array"`` makes :meth:`render` return the camera image (H, W, 3).
 
+    Attributes:
+        blind: While it is set nothing is rendered, which saves most of the time of a step: images are black, and all
+            objects hidden. For policies that look at nothing.
+
     Raises:
         ValueError: for a horizon, action repeat, image size or mask scale below one, a goal outside the workspace, or
             an action that is not finite or has another shape.
@@ -84,6 +89,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     plane: ClassVar[tuple[float, float, float, float] | None] = None
     #: How far the middle of an object lies behind its visible surface, metres along the optical axis.
     depth_offset: ClassVar[float] = 0.0
+    blind: bool = False
 
     def __init__(
         self,
@@ -300,6 +306,20 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     def _observe(self, data: mujoco.MjData, goal: np.ndarray | None = None) -> Observation:
         self._check_physics(data)
         goal = self._goal if goal is None else goal
+        pixels, masks, estimate, seen = self._nothing() if self.blind else self._look(data, goal)
+        observation = {
+            "pixels": pixels,
+            "masks": masks,
+            "proprio": self._proprio(data).astype(np.float32),
+            "object_position": estimate if seen.all() else np.where(seen[:, None], estimate, self._last_seen),
+            "object_visible": seen,
+            "goal_position": goal.copy(),
+        }
+        if self.privileged:
+            observation["object_position_true"] = self._relative(self._true_position(data))
+        return observation
+
+    def _look(self, data: mujoco.MjData, goal: np.ndarray) -> _Seen:
         frame = self.camera.render(data, depth=self._plane is None)
         fine_masks = np.array([_any_of(frame.geoms, ids) for ids in self._geom_ids])
         masks = fine_masks[:, self.mask_scale // 2 :: self.mask_scale, self.mask_scale // 2 :: self.mask_scale]
@@ -310,25 +330,20 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
             depth=None if frame.depth is None else torch.from_numpy(frame.depth[None] + self.depth_offset),
             plane=self._plane,
         )
-        seen = visible.numpy()
-        estimate = self._relative(world.numpy())
-        observation = {
-            "pixels": self._paint_target(frame.pixels, masks.any(0), goal, data).transpose(2, 0, 1),
-            "masks": masks.copy(),
-            "proprio": self._proprio(data).astype(np.float32),
-            "object_position": estimate if seen.all() else np.where(seen[:, None], estimate, self._last_seen),
-            "object_visible": seen,
-            "goal_position": goal.copy(),
-        }
-        if self.privileged:
-            observation["object_position_true"] = self._relative(self._true_position(data))
-        return observation
+        pixels = self._paint_target(frame.pixels, masks.any(0), goal, data).transpose(2, 0, 1)
+        return pixels, masks.copy(), self._relative(world.numpy()), visible.numpy()
+
+    def _nothing(self) -> _Seen:
+        shape, objects = (self.image_size, self.image_size), len(self.objects)
+        hidden = np.zeros((objects, *shape), bool), np.zeros_like(self._last_seen), np.zeros(objects, bool)
+        return np.zeros((3, *shape), np.uint8), *hidden
 
     def _check_physics(self, data: mujoco.MjData) -> None:
         """MuJoCo goes on after a warning, with a state that is reset or contacts that are missing."""
-        for kind, warning in zip(mujoco.mjtWarning.__members__, data.warning, strict=False):
-            if warning.number and kind != "mjWARN_VGEOMFULL":  # the camera's own
-                raise SimulationDivergedError(f"MuJoCo's simulation broke down ({kind} at {warning.lastinfo})")
+        if data.warning.number.any():
+            for kind, warning in zip(mujoco.mjtWarning.__members__, data.warning, strict=False):
+                if warning.number and kind != "mjWARN_VGEOMFULL":  # the camera's own
+                    raise SimulationDivergedError(f"MuJoCo's simulation broke down ({kind} at {warning.lastinfo})")
         farthest = np.abs(data.xpos).max()
         if not farthest < _FARTHEST * self.model.stat.extent:
             raise SimulationDivergedError(f"MuJoCo's simulation broke down (a body is {farthest:.3g} m away)")

@@ -7,7 +7,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, episode_records, goal_images, measure, transition
+from torchrl_ocwm.evaluation.episodes import (
+    EvaluationEnvs,
+    Footage,
+    episode_records,
+    goal_images,
+    measure,
+    transition,
+)
 from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
 from torchrl_ocwm.evaluation.imagined import imagined_distance, imagined_rollout
 from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation
@@ -29,6 +36,7 @@ __all__ = [
     "Diagnosis",
     "Evaluation",
     "EvaluationEnvs",
+    "Footage",
     "LandmarkEvaluation",
     "OpenLoopFilm",
     "ReconstructionError",

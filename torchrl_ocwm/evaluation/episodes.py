@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
+from math import ceil
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
-from torchrl_ocwm.envs import Task, find_environment, make_env, make_scene
+from torchrl_ocwm.envs import Task, find_environment, make_scene
 from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.evaluation.randomness import EpisodeRandomness
@@ -26,43 +27,65 @@ with needs("an evaluation", "recipes"):
     from tqdm import tqdm
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
-_KEPT = ("object_position", "object_position_true", "reward")
+Observation = dict[str, np.ndarray]
+Inspect = Callable[[TensorDictBase], dict[str, Any]]
+_TRUE = ("object_position_true",)
+_KEPT = ("object_position", *_TRUE, "reward")
 _SEEN = ("pixels", "masks", "proprio", "object_position", "object_visible", "goal_position")
 
 
 class SteppedEnvs:
     """Environments that are stepped one after the other, made when they are first needed.
 
+    They are gymnasium's: what TorchRL adds to a single step of a single environment takes longer than its physics.
+
     Args:
         make: Makes one.
         alive: Called after each step.
     """
 
-    def __init__(self, make: Callable[[], EnvBase], alive: Callable[[], None]) -> None:
+    def __init__(self, make: Callable[[], Any], alive: Callable[[], None]) -> None:
         self.make, self.alive = make, alive
-        self.envs: list[EnvBase] = []
+        self.envs: list[Any] = []
+        self._dropped: tuple[str, ...] = ()
 
-    def reset(self, starts: list[dict[str, Any]]) -> TensorDictBase:
-        """Reset as many environments as there are arguments; the first observations ``[E]``."""
+    def reset(self, starts: list[dict[str, Any]], blind: bool = False) -> TensorDictBase:
+        """Reset as many environments as there are arguments; the first observations ``[E]``.
+
+        Args:
+            starts: Arguments of each.
+            blind: Until the next reset nothing is rendered (:class:`~torchrl_ocwm.envs.PositioningEnv`), and images
+                are left out.
+        """
         while len(self.envs) < len(starts):
             self.envs.append(self.make())
             self.alive()
-        return self._all(lambda index: self.envs[index].reset(**starts[index]), len(starts))
+        self._dropped = ("pixels", "masks") if blind else ()
+        observations = []
+        for env, start in zip(self.envs, starts, strict=False):
+            env.blind = blind
+            observations.append(env.reset(**start)[0])
+            self.alive()
+        return self._batch(observations, is_init=True)
 
     def step(self, actions: Tensor) -> TensorDictBase:
         """Do the actions ``[E, A]``; what comes next ``[E]``."""
-
-        def one(index: int) -> TensorDictBase:
-            return self.envs[index].step(TensorDict({"action": actions[index]}))["next"]
-
-        return self._all(one, len(actions))
-
-    def _all(self, call: Callable[[int], TensorDictBase], number: int) -> TensorDictBase:
         results = []
-        for index in range(number):
-            results.append(call(index))
+        for env, action in zip(self.envs, actions.numpy(), strict=False):
+            results.append(env.step(action))
             self.alive()
-        return torch.stack(results)
+        observations, rewards, terminated, truncated, _ = zip(*results, strict=True)
+        ends = torch.tensor([terminated, truncated]).unsqueeze(-1)
+        next_ = self._batch(
+            observations, is_init=False, reward=torch.tensor(rewards, dtype=torch.float32).unsqueeze(-1)
+        )
+        return next_.update({"terminated": ends[0], "truncated": ends[1], "done": ends.any(0)})
+
+    def _batch(self, observations: Sequence[Observation], *, is_init: bool, **more: Tensor) -> TensorDictBase:
+        keys = [key for key in observations[0] if key not in self._dropped]
+        seen = {key: torch.from_numpy(np.stack([one[key] for one in observations])) for key in keys}
+        begins = torch.full((len(observations), 1), is_init)
+        return TensorDict({**seen, "is_init": begins, **more}, [len(observations)])
 
     def close(self) -> None:
         """Close the environments."""
@@ -88,7 +111,7 @@ class EvaluationEnvs:
     ) -> None:
         self.task, self.episode_steps, self.envs = task, episode_steps, envs
         options = {**task.options, "horizon": episode_steps, "privileged": True}
-        make = partial(SteppedEnvs, partial(make_env, find_environment(task.name), **options))
+        make = partial(SteppedEnvs, partial(make_scene, find_environment(task.name), **options))
         self._workers: list[Worker] = []
         try:
             for _ in range(max(workers, 1)):
@@ -108,7 +131,8 @@ class EvaluationEnvs:
         seed: int = 0,
         numbers: Tensor | None = None,
         keep: tuple[Any, ...] = (),
-        inspect: Callable[[TensorDictBase], dict[str, Any]] | None = None,
+        inspect: Inspect | None = None,
+        blind: bool = False,
         progress: bool = False,
     ) -> TensorDict:
         """One episode for each goal, acting without exploration.
@@ -125,7 +149,10 @@ class EvaluationEnvs:
             seed: Seeds the episodes, together with the goals' numbers.
             numbers: ``[N]`` int64, the goals' numbers; 0, 1, 2, … by default.
             keep: More keys to keep of each step.
-            inspect: Called with each step's tensordict ``[E]`` after the policy; what it returns is kept too.
+            inspect: Called with each step's tensordict ``[E]`` after the policy, in which ``goal_number`` ``[E]`` says
+                whose episodes these are; what it returns is kept too.
+            blind: Render nothing, for a policy that looks at nothing: several times faster. No image is made, all
+                objects are hidden, and only ``object_position_true`` is kept by itself.
             progress: Show a progress bar.
 
         Returns:
@@ -138,12 +165,15 @@ class EvaluationEnvs:
         """
         goals = self.task.workspace.check(goals)
         numbers = torch.arange(len(goals)) if numbers is None else numbers
+        kept = (*(_TRUE if blind else _KEPT), *keep)
         batches = []
         with tqdm(total=len(goals), unit="goal", desc="evaluate", disable=not progress) as bar:
             for chunk in torch.arange(len(goals)).split(self.envs * len(self._workers)):
+                given = TensorDict({"goal_number": numbers[chunk]}, [len(chunk)])
+                if images is not None:
+                    given["goal", "pixels"] = images[chunk]
                 seeds = [episode_seed("evaluate", seed, number) for number in numbers[chunk].tolist()]
-                seen = None if images is None else images[chunk]
-                batches.append(self._episodes(policy, goals[chunk], seeds, seen, keep, inspect))
+                batches.append(self._episodes(policy, goals[chunk], seeds, given, kept, inspect, blind))
                 bar.update(len(chunk))
         return TensorDict.cat(batches)
 
@@ -153,36 +183,36 @@ class EvaluationEnvs:
         policy: Policy,
         goals: Tensor,
         seeds: list[int],
-        images: Tensor | None,
-        keep: tuple[Any, ...],
-        inspect: Callable[[TensorDictBase], dict[str, Any]] | None,
+        given: TensorDictBase,
+        kept: tuple[Any, ...],
+        inspect: Inspect | None,
+        blind: bool,
     ) -> TensorDict:
         starts = [
             {"seed": seed, "options": {"goal_position": goal.numpy()}} for seed, goal in zip(seeds, goals, strict=True)
         ]
-        tensordict = self._together("reset", starts)
-        if images is not None:
-            tensordict["goal"] = TensorDict({"pixels": images}, [len(goals)])
+        tensordict = self._together("reset", starts, blind).update(given)
         steps = []
         randomness = EpisodeRandomness(seeds)
         for _ in range(self.episode_steps):
             with set_exploration_type(ExplorationType.DETERMINISTIC), randomness:
                 tensordict = policy(tensordict)
             tensordict["next"] = self._together("step", tensordict["action"])
-            kept = tensordict["next"].select(*_KEPT, *keep).clone()
+            step = tensordict["next"].select(*kept).clone()
             if inspect is not None:
-                kept.update(inspect(tensordict))
-            steps.append(kept)
+                step.update(inspect(tensordict))
+            steps.append(step)
             tensordict = step_mdp(tensordict, keep_other=True, exclude_action=False)
         episodes = TensorDict.stack(steps, 1)
         return episodes.set("goal_position", goals.unsqueeze(1).expand(-1, self.episode_steps, -1).clone())
 
-    def _together(self, method: str, arguments: Any) -> TensorDictBase:
+    def _together(self, method: str, arguments: Any, *shared: Any) -> TensorDictBase:
         """Call a method of the environments of every process at the same time, each with its part of the arguments."""
-        parts = [arguments[start : start + self.envs] for start in range(0, len(arguments), self.envs)]
+        size = ceil(len(arguments) / len(self._workers))
+        parts = [arguments[start : start + size] for start in range(0, len(arguments), size)]
         at_work = self._workers[: len(parts)]
         for worker, part in zip(at_work, parts, strict=True):
-            worker.request(method, part)
+            worker.request(method, part, *shared)
         return torch.cat([worker.answer() for worker in at_work])
 
     def close(self) -> None:
@@ -201,6 +231,29 @@ def transition(step: TensorDictBase) -> dict[str, TensorDictBase]:
     """What a dataset keeps of a step, for ``inspect`` of :meth:`EvaluationEnvs.run`; see :func:`episode_records`."""
     ends = [("next", name) for name in ("reward", "done", "terminated")]
     return {"transition": step.select("action", *_SEEN, *(("next", name) for name in _SEEN), *ends).clone()}
+
+
+class Footage:
+    """Keeps all of a few goals' episodes while many are run, for ``inspect`` of :meth:`EvaluationEnvs.run`.
+
+    Args:
+        numbers: ``[K]`` int64, the goals' numbers, in the order of the run.
+    """
+
+    def __init__(self, numbers: Tensor) -> None:
+        self.numbers = numbers
+        self._together: dict[tuple[int, ...], list[TensorDictBase]] = {}
+
+    def __call__(self, step: TensorDictBase) -> None:
+        """Keep the rows of these goals of a step's tensordict ``[E]``."""
+        seen = step[torch.isin(step["goal_number"], self.numbers)]
+        if len(seen):
+            kept = TensorDict({"latent": seen["latent"], **transition(seen)}, seen.batch_size)
+            self._together.setdefault(tuple(seen["goal_number"].tolist()), []).append(kept)
+
+    def episodes(self) -> TensorDictBase:
+        """What was kept, ``[K, T]``, with the policy's ``latent`` and the ``transition`` of each step."""
+        return torch.cat([torch.stack(steps, 1) for steps in self._together.values()])
 
 
 def episode_records(episodes: TensorDictBase) -> TensorDictBase:

@@ -2,55 +2,121 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from copy import deepcopy
+from functools import partial
+
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
 
 from torchrl_ocwm.agents.agent import Agent
-from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, goal_images, measure
+from torchrl_ocwm.envs import ENVIRONMENTS, Task, find_environment
+from torchrl_ocwm.envs.registry import Environment
+from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, Policy, goal_images, measure
+from torchrl_ocwm.processes import Worker, make_worker
 from torchrl_ocwm.settings import SettingsError
+
+_TIMEOUT = 300.0  # seconds without a step; where training uses all cores, an environment may take long to load
 
 
 class LandmarkEvaluation:
-    """Evaluate an agent on its task's landmark goals, in this process.
+    """Evaluate an agent on its task's landmark goals, in this process or beside it.
 
     An agent that takes goals as images only is given images of them.
 
     The paper draws its training curves with ten such goals. The environments are made at the first call and kept until
     it is closed.
 
+    TorchRL's ``Evaluator`` also evaluates in a process of its own. It has no starts and no random numbers that belong
+    to a goal, so its scores would not be those of :class:`EvaluationEnvs`.
+
     Args:
         agent: The agent in training.
         episodes: Episodes, one to each of the first landmarks.
         episode_steps: Steps of each.
+        beside: Evaluate a copy of the weights in a process of its own, on the CPU. It starts at once.
 
     Raises:
         SettingsError: if there are more episodes than landmarks.
     """
 
-    def __init__(self, agent: Agent, *, episodes: int, episode_steps: int) -> None:
-        landmarks = agent.task.workspace.landmarks
+    def __init__(self, agent: Agent, *, episodes: int, episode_steps: int, beside: bool = False) -> None:
+        task, landmarks = agent.task, agent.task.workspace.landmarks
         if episodes > len(landmarks):
-            raise SettingsError(f"eval_episodes={episodes}, but {agent.task.name} has {len(landmarks)} landmark goals")
-        self.policy, self.goals = agent.policy(), torch.tensor(landmarks[:episodes])
-        self.images = (
-            None
-            if self.policy.takes_positions
-            else goal_images(agent.task, self.goals, object_index=self.policy.object_index)
-        )
-        self.envs = EvaluationEnvs(agent.task, episode_steps=episode_steps, workers=0, envs=episodes)
+            raise SettingsError(f"eval_episodes={episodes}, but {task.name} has {len(landmarks)} landmark goals")
+        self.policy, self.goals, self.beside = agent.policy(), torch.tensor(landmarks[:episodes]), beside
+        index = self.policy.object_index
+        images = None if self.policy.takes_positions else goal_images(task, self.goals, object_index=index)
+        # Without the agent that a policy knows.
+        acts = deepcopy(TensorDictSequential(*self.policy.module)).cpu() if beside else self.policy
+        make = partial(LandmarkEpisodes, acts, find_environment(task.name), task, self.goals, images, index)
+        self._worker: Worker = make_worker(partial(make, episode_steps), process=beside, timeout=_TIMEOUT)
+        self._is_ready = False
 
-    def __call__(self, updates: int) -> dict[str, float]:  # noqa: ARG002
-        """Scores to log."""
-        scores = measure(
-            self.envs.run(self.policy, self.goals, images=self.images), object_index=self.policy.object_index
-        )
-        return {f"evaluation/{name}": float(values.nanmean()) for name, values in scores.items()}
+    def __call__(self, updates: int) -> dict[str, float] | Worker:  # noqa: ARG002
+        """Scores to log, or what will answer with them."""
+        if not self._is_ready:
+            self._worker.ready()
+            self._is_ready = True
+        weights = {name: value.cpu() for name, value in self.policy.state_dict().items()} if self.beside else None
+        self._worker.request("scores", weights)
+        return self._worker if self.beside else self._worker.answer()
 
     def close(self) -> None:
-        """Close the environments; a later call makes them again."""
-        self.envs.close()
+        """Close the environments, and end the process."""
+        self._worker.close()
 
     def __enter__(self) -> LandmarkEvaluation:
         return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+
+class LandmarkEpisodes:
+    """Plays the episodes of a :class:`LandmarkEvaluation`.
+
+    Args:
+        policy: Acts.
+        environment: The environment, which another process need not know.
+        task: The task.
+        goals: ``[N, D]`` metres.
+        images: ``[N, 3, H, W]`` uint8, what the policy is given instead.
+        object_index: Which object is to go there.
+        episode_steps: Steps of an episode.
+        alive: Called after each step.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        environment: Environment,
+        task: Task,
+        goals: Tensor,
+        images: Tensor | None,
+        object_index: int,
+        episode_steps: int,
+        alive: Callable[[], None],
+    ) -> None:
+        ENVIRONMENTS.setdefault(environment.name, environment)
+        self.policy, self.goals, self.images, self.object_index = policy, goals, images, object_index
+        self.envs = EvaluationEnvs(task, episode_steps=episode_steps, workers=0, envs=len(goals))
+        self.alive = alive
+
+    def scores(self, weights: dict[str, Tensor] | None) -> dict[str, float]:
+        """Means over the goals, with these weights of the policy if they are given."""
+        if weights is not None:
+            assert isinstance(self.policy, torch.nn.Module)
+            self.policy.load_state_dict(weights)
+        scores = measure(self.envs.run(self._act, self.goals, images=self.images), object_index=self.object_index)
+        return {f"evaluation/{name}": float(values.nanmean()) for name, values in scores.items()}
+
+    def _act(self, step: TensorDictBase) -> TensorDictBase:
+        self.alive()
+        return self.policy(step)
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.envs.close()

@@ -1,5 +1,6 @@
 """How it runs: training on a dataset, and training that collects its own."""
 
+from torchrl_ocwm.training.cores import evaluates_beside
 from torchrl_ocwm.training.memory import check_memory
 from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.online import collect_seed_steps, train_online
@@ -13,6 +14,7 @@ __all__ = [
     "Training",
     "check_memory",
     "collect_seed_steps",
+    "evaluates_beside",
     "make_stepper",
     "train_offline",
     "train_online",

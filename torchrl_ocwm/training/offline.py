@@ -9,8 +9,9 @@ from pathlib import Path
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.data import EpisodeDataset
 from torchrl_ocwm.devices import usable_device
+from torchrl_ocwm.training.evaluations import Evaluate, EvaluationError
 from torchrl_ocwm.training.hooks import ProgressBar
-from torchrl_ocwm.training.run import CHECKPOINT, SHOWN, Evaluate, EvaluationError, Film, Run, check_task, own
+from torchrl_ocwm.training.run import CHECKPOINT, SHOWN, Film, Run, check_task, own
 from torchrl_ocwm.training.settings import Training
 
 __all__ = ["CHECKPOINT", "EvaluationError", "train_offline"]
@@ -39,7 +40,9 @@ def train_offline(
         folder: Where checkpoint and logs go. One run at a time writes to it.
         training: The settings.
         evaluate: Called every ``eval_interval`` updates with their number, after the checkpoint that is due; returns
-            scores to log.
+            scores to log, or an object whose ``done()`` says whether ``answer()`` has them: they are logged when they
+            are there, at the updates that they belong to, and the next evaluation and the end of the run wait for
+            them. SIGTERM and Ctrl-C do not.
         film: Called every ``video_interval`` updates with their number; returns the file of a video that it wrote. If
             it fails, training goes on with a warning.
         on_start: Called once, when nothing stands against the run and before its first update.

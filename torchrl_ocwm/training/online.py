@@ -21,8 +21,9 @@ from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs import find_environment, make_env
 from torchrl_ocwm.settings import from_dict
 from torchrl_ocwm.training.collectors import NUMBER, Turns, end, make_collector, next_episodes, send_weights
+from torchrl_ocwm.training.evaluations import Evaluate
 from torchrl_ocwm.training.hooks import ProgressBar, StopOnSignals, UpdateClock
-from torchrl_ocwm.training.run import CHECKPOINT, SHOWN, Evaluate, Film, Run, check_task, own
+from torchrl_ocwm.training.run import CHECKPOINT, SHOWN, Film, Run, check_task, own
 from torchrl_ocwm.training.settings import Online, Training
 
 _NEXT = "next_online_episode"

@@ -18,8 +18,9 @@ from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.archive import Archive, recover
 from torchrl_ocwm.agents.checkpoint import check_same_agent, describe
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals, make_replay_buffer
-from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.files import only_writer
+from torchrl_ocwm.training.cores import update_threads
+from torchrl_ocwm.training.evaluations import Evaluate, Evaluations
 from torchrl_ocwm.training.hooks import Every, LossLog, ProgressBar, RunTrainer, StopOnSignals, UpdateClock
 from torchrl_ocwm.training.loggers import make_loggers
 from torchrl_ocwm.training.provenance import check_may_go_on, trained_with
@@ -29,12 +30,7 @@ from torchrl_ocwm.training.stepper import make_schedule, make_stepper
 CHECKPOINT = "checkpoint.zip"
 SHOWN = ("loss_model_pixels", "loss_model_object_position", "loss_actor", "loss_value")
 
-Evaluate = Callable[[int], dict[str, float]]
 Film = Callable[[int], Path]
-
-
-class EvaluationError(UserError, RuntimeError):
-    """An evaluation during training failed, for a reason that the user can mend; nothing is lost."""
 
 
 class Run:
@@ -66,8 +62,8 @@ class Run:
         if file.exists():
             check_same_agent(agent, file)
             check_may_go_on(file, training, dataset, grows=grows)
-        if training.threads:
-            torch.set_num_threads(training.threads)
+        if threads := update_threads(training, agent.size):
+            torch.set_num_threads(threads)
         torch.manual_seed(training.seed)
         agent.to(training.device).train()
         sample = Sampler(agent, dataset, training)
@@ -110,28 +106,24 @@ class Run:
         self.loggers.cut_back(self.updates)
         with self.stop as stop, self.bar.running(self.updates, training.updates):
             Every(trainer, training.checkpoint_interval, self._save, at_end=True)
+            evaluations = None
             if evaluate is not None:
-                Every(trainer, training.eval_interval, partial(self._evaluate, partial(stop.look, evaluate)))
+                evaluations = Evaluations(evaluate, look=stop.look, save=self._save_now, loggers=self.loggers)
+                trainer.register_op("post_steps_log", evaluations.check)
+                Every(trainer, training.eval_interval, evaluations.begin)
             if film is not None:
                 Every(trainer, training.video_interval, partial(self._film, partial(stop.look, film)))
             trainer.train()
+            if evaluations is not None:
+                evaluations.wait()
         self._save(self.updates)  # of a clock that was stopped between two updates
 
     def _save(self, updates: int) -> None:  # noqa: ARG002
         self.trainer.save_trainer(force_save=True)
 
-    def _evaluate(self, evaluate: Evaluate, updates: int) -> dict[str, float]:
-        try:
-            return evaluate(updates)
-        except Exception as error:
-            self._save(updates)
-            message = (
-                f"the evaluation after {updates} updates failed ({type(error).__name__}: {error}); the checkpoint of "
-                "this update is kept: run the same command again to go on, with training.eval_interval=0 if need be"
-            )
-            if isinstance(error, (UserError, OSError)):  # what the machine or the settings lack
-                raise EvaluationError(message) from error
-            raise RuntimeError(message) from error
+    def _save_now(self) -> int:
+        self._save(self.updates)
+        return self.updates
 
     def _film(self, film: Film, updates: int) -> None:
         try:

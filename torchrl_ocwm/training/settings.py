@@ -23,12 +23,15 @@ class Training(Settings):
         updates: Updates of model, actor and critic in all.
         seed: Seeds weights and sampling.
         device: Where to train.
-        threads: Threads of PyTorch on a CPU; 0 leaves PyTorch's own choice.
+        threads: Threads of PyTorch on a CPU; 0 leaves PyTorch's own choice. ``None``: one where the networks are as
+            small as those of the size ``cpu``, which leaves a core to evaluations, otherwise PyTorch's own choice.
         log_interval: Updates between two lines of the log, over which losses are averaged.
         checkpoint_interval: Updates between two checkpoints.
         eval_interval: Updates between two evaluations; 0 for none.
         eval_episodes: Episodes per evaluation, one to each of the task's first landmark goals.
         eval_steps: Steps per episode.
+        eval_beside: Evaluate a copy of the weights in a process of its own, while training goes on; ``None`` does so if
+            the updates leave a core free. What is learnt does not depend on it.
         video_interval: Updates between two open-loop prediction videos; 0 for none.
         goals: Goals of the sampled sequences: ``"uniform"`` draws a fresh one for each, ``"stored"`` keeps those of the
             dataset, ``"auto"`` keeps them if the images show them (``virtual_target``), and draws them otherwise.
@@ -47,12 +50,13 @@ class Training(Settings):
     updates: int = setting(10_000, at_least=1, at_most=10**9)
     seed: int = setting(0, at_least=0, at_most=2**32 - 1, resume="same")
     device: str = "cpu"
-    threads: int = setting(0, at_least=0, at_most=1024)
+    threads: int | None = setting(None, at_least=0, at_most=1024)
     log_interval: int = setting(50, at_least=1)
     checkpoint_interval: int = setting(500, at_least=1)
     eval_interval: int = setting(500, at_least=0)
     eval_episodes: int = setting(10, at_least=1)
     eval_steps: int = setting(100, at_least=1)
+    eval_beside: bool | None = None
     video_interval: int = setting(2000, at_least=0)
     goals: Literal["auto", "uniform", "stored"] = setting("auto", resume="asked")
     compile: bool | None = None
