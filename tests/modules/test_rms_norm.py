@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch.nn.functional import rms_norm
-from torchrl.modules import DreamerV3ImageEncoder, DreamerV3MLP
+from torch.nn.functional import rms_norm, silu
+from torchrl.modules import DreamerV3ImageDecoder, DreamerV3ImageEncoder, DreamerV3MLP
 
-from torchrl_ocwm.modules.rms_norm import RMSNorm, fast_norms
+from torchrl_ocwm.modules.networks import ImageDecoder
+from torchrl_ocwm.modules.rms_norm import ChannelRMSNormSiLU, RMSNorm, fast_norms
 
 
-@pytest.mark.parametrize(("shape", "dim"), [((7, 5), -1), ((2, 3, 5), -1), ((2, 5, 3, 4), -3)])
-def test_values_and_gradients_are_those_of_pytorch(shape: tuple[int, ...], dim: int) -> None:
+@pytest.mark.parametrize(
+    ("kind", "shape", "dim"),
+    [(RMSNorm, (7, 5), -1), (RMSNorm, (2, 3, 5), -1), (ChannelRMSNormSiLU, (2, 5, 3, 4), -3)],
+)
+def test_values_and_gradients_are_those_of_pytorch(kind: type[RMSNorm], shape: tuple[int, ...], dim: int) -> None:
     features = shape[dim]
-    norm = RMSNorm(torch.nn.Parameter(torch.rand(features)), eps=0.1, dim=dim)
+    norm = kind(torch.nn.Parameter(torch.rand(features)), eps=0.1)
     value = torch.randn(shape, requires_grad=True)
     slow = value.detach().double().requires_grad_()
     weight = norm.weight.detach().double().requires_grad_()
     expected = rms_norm(slow.movedim(dim, -1), (features,), weight, 0.1).movedim(-1, dim)
+    expected = expected if kind is RMSNorm else silu(expected)
     got, gradient = norm(value), torch.randn(shape)
     torch.testing.assert_close(got, expected.float())
     got.backward(gradient)
@@ -37,17 +42,25 @@ def test_calculates_in_float32() -> None:
 
 
 @pytest.mark.parametrize(
-    ("network", "value"),
+    ("network", "value", "kind"),
     [
-        (DreamerV3MLP(4, 3, depth=2, num_cells=8), torch.randn(5, 4)),
-        (DreamerV3ImageEncoder(3, 4, (1, 2)), torch.rand(2, 3, 8, 8)),
+        (DreamerV3MLP(4, 3, depth=2, num_cells=8), torch.randn(5, 4), RMSNorm),
+        (DreamerV3ImageEncoder(3, 4, (1, 2)), torch.rand(2, 3, 8, 8), ChannelRMSNormSiLU),
     ],
 )
 def test_replaces_all_norms_of_a_network_and_keeps_its_parameters(
-    network: torch.nn.Module, value: torch.Tensor
+    network: torch.nn.Module, value: torch.Tensor, kind: type[RMSNorm]
 ) -> None:
     expected, names = network(value), [name for name, _ in network.named_parameters()]
     torch.testing.assert_close(fast_norms(network)(value), expected)
     assert [name for name, _ in network.named_parameters()] == names
     norms = [type(module) for module in network.modules() if "RMSNorm" in type(module).__name__]
-    assert norms == [RMSNorm, RMSNorm]
+    assert norms == [kind, kind]
+
+
+def test_decoder_is_that_of_torchrl() -> None:
+    plain = DreamerV3ImageDecoder(5, (3, 8, 8), 4, (1, 2), num_blocks=1)
+    ours = fast_norms(ImageDecoder(5, (3, 8, 8), 4, (1, 2), num_blocks=1))
+    ours.load_state_dict(plain.state_dict())
+    latent = torch.randn(2, 3, 4), torch.randn(2, 3, 1)
+    torch.testing.assert_close(ours(*latent), plain(*latent))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import conv_transpose2d, silu
+from torch.nn.functional import conv_transpose2d
 from torchrl.modules import (
     MLP,
     DreamerV3ImageDecoder,
@@ -136,7 +136,7 @@ class ImageDecoder(DreamerV3ImageDecoder):
         """Images ``[..., C, H, W]`` of latents."""
         latent = torch.cat(inputs, -1)
         hidden = self.projection(latent.flatten(0, -2)).unflatten(-1, self.initial_shape)
-        hidden = self.layers[:-1](silu(self.projection_norm(hidden)))
+        hidden = self.layers[:-1](self.projection_norm(hidden))  # with its SiLU
         last = self.layers[-1]
         image = conv_transpose2d(hidden, last.weight, last.bias + 0.5, last.stride, last.padding, last.output_padding)
         return image.unflatten(0, latent.shape[:-1])

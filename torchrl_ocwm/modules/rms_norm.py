@@ -7,21 +7,20 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import silu
 from torchrl.modules.models import model_based
 
 Module = TypeVar("Module", bound=nn.Module)
 
 
 class RMSNorm(nn.Module):
-    """Values by their root mean square over one dimension, times a learnt weight.
+    """Values by their root mean square over the last dimension, times a learnt weight.
 
     Args:
         weight: ``[C]``.
         eps: Added to the mean square.
-        dim: The dimension of C features.
 
-    Called with ``[..., C]``, or what has C features at ``dim``; returns the same shape and dtype. It calculates in
-    float32.
+    Called with ``[..., C]``; returns the same shape and dtype. It calculates in float32.
 
     Examples:
         >>> RMSNorm(nn.Parameter(torch.ones(2)))(torch.tensor([[3.0, 4.0]]))
@@ -30,17 +29,31 @@ class RMSNorm(nn.Module):
 
     eps: Tensor
 
-    def __init__(self, weight: nn.Parameter, eps: float = 1e-4, dim: int = -1) -> None:
+    def __init__(self, weight: nn.Parameter, eps: float = 1e-4) -> None:
         super().__init__()
-        self.weight, self.dim = weight, dim
+        self.weight = weight
         self.register_buffer("eps", torch.tensor(eps, device=weight.device), persistent=False)
 
     def forward(self, value: Tensor) -> Tensor:
         """Normalise."""
-        if self.dim == -1:
-            return _RMSNorm.apply(value, self.weight, self.eps)
-        last = value.movedim(self.dim, -1).contiguous()  # channels last, which convolutions are faster with, too
-        return _RMSNorm.apply(last, self.weight, self.eps).movedim(-1, self.dim)
+        return _RMSNorm.apply(value, self.weight, self.eps)
+
+
+class ChannelRMSNormSiLU(RMSNorm):
+    """SiLU of the channels ``[..., C, H, W]`` of images, normalised as :class:`RMSNorm` does it.
+
+    Both at once keep one copy of an image for the backward pass instead of three.
+
+    Examples:
+        >>> channels = torch.tensor([3.0, 4.0]).reshape(2, 1, 1)
+        >>> ChannelRMSNormSiLU(nn.Parameter(torch.ones(2)))(channels).detach().flatten()
+        tensor([0.5942, 0.8554])
+    """
+
+    def forward(self, value: Tensor) -> Tensor:
+        """Normalise and activate."""
+        last = value.movedim(-3, -1).contiguous()  # channels last, which convolutions are faster with, too
+        return _RMSNormSiLU.apply(last, self.weight, self.eps).movedim(-1, -3)
 
 
 class _RMSNorm(torch.autograd.Function):
@@ -49,8 +62,7 @@ class _RMSNorm(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, value: Tensor, weight: Tensor, eps: Tensor) -> Tensor:
         x = value.float()
-        norm = torch.linalg.vector_norm(x, dim=-1, keepdim=True)  # in one pass: |x|² = C · mean x²
-        scale = torch.addcmul(eps, norm, norm, value=1 / x.shape[-1]).rsqrt_()
+        scale = _scale(x, eps)
         unit = x * scale
         ctx.save_for_backward(unit, scale, weight)
         return (unit * weight).to(value.dtype)
@@ -59,20 +71,58 @@ class _RMSNorm(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         unit, scale, weight = ctx.saved_tensors
-        gradient_float = gradient.float()
-        product = gradient_float * unit
-        along = (product @ weight).unsqueeze(-1)
-        of_value = (gradient_float * weight).addcmul_(unit, along, value=-1 / len(weight)).mul_(scale)
-        return of_value.to(gradient.dtype), product.flatten(0, -2).sum(0), None
+        along, of_weight = _gradients(gradient.float(), unit, weight)
+        of_unit = gradient.float() * weight
+        return of_unit.addcmul_(unit, along, value=-1 / len(weight)).mul_(scale).to(gradient.dtype), of_weight, None
+
+
+class _RMSNormSiLU(torch.autograd.Function):
+    """z σ(z) of z = x r w."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, weight: Tensor, eps: Tensor) -> Tensor:
+        x = value.float()
+        scale = _scale(x, eps)
+        ctx.save_for_backward(value, scale, weight)
+        return silu((x * scale).mul_(weight), inplace=True).to(value.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
+        value, scale, weight = ctx.saved_tensors
+        unit = value.float() * scale
+        inner = torch.ops.aten.silu_backward(gradient.float(), unit * weight)
+        along, of_weight = _gradients(inner, unit, weight)
+        of_unit = inner.mul_(weight)  # in place: images are large
+        return of_unit.addcmul_(unit, along, value=-1 / len(weight)).mul_(scale).to(gradient.dtype), of_weight, None
+
+
+def _scale(x: Tensor, eps: Tensor) -> Tensor:
+    """The scale r ``[..., 1]`` of values ``[..., C]``."""
+    norm = torch.linalg.vector_norm(x, dim=-1, keepdim=True)  # in one pass: |x|² = C · mean x²
+    return torch.addcmul(eps, norm, norm, value=1 / x.shape[-1]).rsqrt_()
+
+
+def _gradients(gradient: Tensor, unit: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """From the gradient of y = u w with u = x r: w · g u ``[..., 1]``, and that of w ``[C]``."""
+    product = gradient * unit
+    return (product @ weight).unsqueeze(-1), product.flatten(0, -2).sum(0)
 
 
 def fast_norms(module: Module) -> Module:
-    """Replace TorchRL's RMS normalisations inside a module; parameters and results stay what they are."""
-    for name, child in module.named_children():
+    """Replace TorchRL's RMS normalisations inside a module, those of channels with the SiLU that follows them.
+
+    Parameters, their names and results stay what they are.
+    """
+    normalised = False
+    for name, child in list(module.named_children()):
         if isinstance(child, model_based._DreamerV3RMSNorm):
             setattr(module, name, RMSNorm(child.weight, child.eps))
         elif isinstance(child, model_based._DreamerV3ChannelRMSNorm):
-            setattr(module, name, RMSNorm(child.weight, child.eps, dim=-3))
+            setattr(module, name, ChannelRMSNormSiLU(child.weight, child.eps))
+        elif normalised and isinstance(child, nn.SiLU):
+            setattr(module, name, nn.Identity())
         else:
             fast_norms(child)
+        normalised = isinstance(child, model_based._DreamerV3ChannelRMSNorm)
     return module

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -252,17 +252,35 @@ class GoalConditionedDreamerLoss(LossModule):
 
     def forward(self, sample: TensorDictBase) -> TensorDictBase:
         """Losses and metrics of records ``[B, T]``, scalars."""
+        losses = TensorDict()
+        for part in self.parts(sample):
+            losses.update(part)
+        return losses
+
+    def parts(self, sample: TensorDictBase) -> Iterator[TensorDictBase]:
+        """What :meth:`forward` returns: of the world model first, then of one behaviour after the other.
+
+        Each part can be differentiated before the next is computed, which keeps one graph at a time in memory. It is
+        one part if a behaviour trains the world model too, with its replay loss.
+        """
         losses, records = self.model_loss(sample)
         reward = unravel_key(("next", self.model_loss.tensor_keys.reward))
         if (recorded := sample.get(reward, None)) is not None:
             records.set(reward, recorded)  # a world model writes its prediction in the same place
-        for behaviour in self._each():
-            more = behaviour(records)
-            if twice := set(losses.keys()) & set(more.keys()):
-                raise ValueError(f"two losses have the name {sorted(twice)[0]!r}; give the behaviours a prefix each")
-            losses = losses.update(more)
         if self.return_context:
             after, keys = records.get("next"), self.tensor_keys
             latent = {"state": after.get(keys.state), "belief": after.get(keys.belief)}
             losses.set(keys.replay_context, TensorDict(latent, sample.batch_size).detach())
-        return losses
+        # Nothing else is kept: predicted images take much memory.
+        records = records.select(*(key for one in self._each() for key in one.in_keys))
+        names, apart = set(losses.keys()), not any(one.replay_value_loss_weight for one in self._each())
+        for behaviour in self._each():
+            if apart:
+                yield losses
+                losses = TensorDict()
+            more = behaviour(records)
+            if twice := names & set(more.keys()):
+                raise ValueError(f"two losses have the name {sorted(twice)[0]!r}; give the behaviours a prefix each")
+            names |= set(more.keys())
+            losses = losses.update(more)
+        yield losses

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from filelock import FileLock
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torchrl.objectives import SoftUpdate
@@ -49,11 +49,16 @@ class Stepper(DreamerV3OptimizationStepper):
         return sample.select(*self.loss_module.in_keys, strict=False)
 
     def _forward_backward(self, sample: TensorDictBase) -> TensorDictBase:
-        device = sample.get(self.loss_module.tensor_keys.is_init).device.type
-        with torch.autocast(device, torch.bfloat16, enabled=self.mixed_precision):
-            losses = self.loss_module(sample)
-        sum(value for key, value in losses.items() if isinstance(key, str) and key.startswith("loss_")).backward()
-        return losses.detach()
+        device, results = sample.get(self.loss_module.tensor_keys.is_init).device.type, TensorDict()
+        parts = self.loss_module.parts(sample)
+        while True:
+            with torch.autocast(device, torch.bfloat16, enabled=self.mixed_precision):
+                losses = next(parts, None)
+            if losses is None:
+                return results
+            sum(value for key, value in losses.items() if isinstance(key, str) and key.startswith("loss_")).backward()
+            results.update(losses.detach())
+            del losses
 
     def warmup(self, sample: TensorDictBase) -> None:
         """Compile or capture the step on representative data; nothing is trained."""
