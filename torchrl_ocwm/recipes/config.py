@@ -27,6 +27,8 @@ from torchrl_ocwm.parts import Part, load_plugins
 from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
 
 T = TypeVar("T")
+#: All groups of options that there are.
+GROUPS = {"agent", "explore", "size", "env"}
 _QUIET = ("job_logging", "hydra_logging")
 
 
@@ -56,6 +58,7 @@ def recipe(
             with _user_errors():
                 store_options()
                 _check_choices(groups or {}, sys.argv[1:])
+            _forget_groups(GROUPS - set(groups or {}))
             ConfigStore.instance().store(name, _schema(kind, groups or {}, more))
             hydra.main(version_base="1.3", config_path=None, config_name=name)(guarded)()
 
@@ -78,6 +81,12 @@ def store_options() -> None:
         store.store(name, node, group="explore", package=f"agent.behaviours.{EXPLORE}")
     for name, environment in ENVIRONMENTS.items():
         store.store(name, {"name": name, "options": defaults(environment.options)}, group="env")
+
+
+def _forget_groups(groups: Iterable[str]) -> None:
+    """Let a recipe without some groups have plain settings of their names."""
+    for group in groups:
+        ConfigStore.instance().repo.pop(group, None)
 
 
 def _check_choices(groups: Iterable[str], arguments: Iterable[str]) -> None:
