@@ -14,12 +14,12 @@ class LandmarkEvaluation:
 
     An agent that takes goals as images only is given images of them.
 
-    The paper draws its training curves with ten such goals. The environments are made at the first call and kept until
-    it is closed.
+    The paper draws its training curves with episodes to random ones of ten such goals. The environments are made at the
+    first call and kept until it is closed.
 
     Args:
         agent: The agent in training.
-        episodes: Episodes, one to each of the first landmarks.
+        episodes: Episodes, to as many of the landmarks, drawn anew at each call.
         episode_steps: Steps of each.
 
     Raises:
@@ -30,7 +30,7 @@ class LandmarkEvaluation:
         landmarks = agent.task.workspace.landmarks
         if episodes > len(landmarks):
             raise SettingsError(f"eval_episodes={episodes}, but {agent.task.name} has {len(landmarks)} landmark goals")
-        self.policy, self.goals = agent.policy(), torch.tensor(landmarks[:episodes])
+        self.policy, self.goals, self.episodes = agent.policy(), torch.tensor(landmarks), episodes
         self.images = (
             None
             if self.policy.takes_positions
@@ -38,11 +38,13 @@ class LandmarkEvaluation:
         )
         self.envs = EvaluationEnvs(agent.task, episode_steps=episode_steps, workers=0, envs=episodes)
 
-    def __call__(self, updates: int) -> dict[str, float]:  # noqa: ARG002
-        """Scores to log."""
-        scores = measure(
-            self.envs.run(self.policy, self.goals, images=self.images), object_index=self.policy.object_index
-        )
+    def __call__(self, updates: int) -> dict[str, float]:
+        """Scores to log; the number of updates decides which landmarks are drawn."""
+        chosen = torch.randperm(len(self.goals), generator=torch.Generator().manual_seed(updates))
+        chosen = chosen[: self.episodes].sort().values
+        images = None if self.images is None else self.images[chosen]
+        episodes = self.envs.run(self.policy, self.goals[chosen], images=images, numbers=chosen)
+        scores = measure(episodes, object_index=self.policy.object_index)
         return {f"evaluation/{name}": float(values.nanmean()) for name, values in scores.items()}
 
     def close(self) -> None:

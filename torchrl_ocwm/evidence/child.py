@@ -1,8 +1,9 @@
 """A script in a process that ends cleanly when the one that started it has ended, however that was.
 
-    python -m torchrl_ocwm.evidence.child SCRIPT ARGUMENTS...
+    python child.py SCRIPT ARGUMENTS...
 
-The standard input is a pipe whose other end nobody else holds.
+The standard input is a pipe whose other end nobody else holds. It is run by its path, as importing its package would
+cost each process a second.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ def main() -> None:
     """Run the script."""
     Thread(target=_end_with_parent, daemon=True).start()
     del sys.argv[0]
-    sys.path.insert(0, os.path.dirname(sys.argv[0]))
+    sys.path[0] = os.path.dirname(sys.argv[0])
     runpy.run_path(sys.argv[0], run_name="__main__")
 
 

@@ -150,7 +150,7 @@ def seconds_of_acting(agent: Agent) -> float:
         return _seconds(lambda: envs.run(policy, goals, images=given), _STEPS * len(goals))
 
 
-def _agent(task: Task, agent: str, size: str, changes: Mapping[str, Any] = {}) -> Agent:  # noqa: B006
+def _agent(task: Task, agent: str, size: str, changes: Mapping[str, Any] = {}) -> Agent:
     return build_agent(change(AGENTS[agent], changes), task, SIZES[size])
 
 

@@ -186,9 +186,7 @@ FIGURES = {
         ),
         draws=("heatmap", "curves"),
     ),
-    "curves": Figure(
-        title="Scores while agents learn, on five of the landmark goals", rows=_TABLE, draws=("curves",)
-    ),
+    "curves": Figure(title="Scores while agents learn, on five of the landmark goals", rows=_TABLE, draws=("curves",)),
     "exploration": Figure(
         title="FOCUS + LCP on data of different explorers",
         rows=tuple(
@@ -254,12 +252,20 @@ def _evaluated(row: Row, env: str, seed: int, wanted: Evidence) -> Evaluated:
     budget, setup = _known(BUDGETS, "size", wanted.size), _known(SETUPS, "env", env)
     data = _data(row, env, wanted.steps or budget.steps, setup, budget, wanted.size)
     updates = wanted.updates or round(budget.updates * setup.updates)
+    episode_steps = budget.episode_steps or setup.episode_steps
+    trained = Trained(
+        data=data,
+        agent=row.agent,
+        changes=row.changes,
+        size=wanted.size,
+        seed=seed,
+        updates=updates,
+        episode_steps=episode_steps,
+    )
     return Evaluated(
-        trained=Trained(
-            data=data, agent=row.agent, changes=row.changes, size=wanted.size, seed=seed, updates=updates
-        ),
+        trained=trained,
         goals=wanted.goals or budget.goals,
-        episode_steps=budget.episode_steps or setup.episode_steps,
+        episode_steps=episode_steps,
         image_goals=row.image_goals,
         random=row.random,
     )

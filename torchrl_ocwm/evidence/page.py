@@ -14,7 +14,7 @@ from torchrl_ocwm.evidence.estimate import in_words
 from torchrl_ocwm.evidence.figures import FIGURES, Figure, Result
 from torchrl_ocwm.evidence.queue import in_order
 from torchrl_ocwm.evidence.records import Record
-from torchrl_ocwm.evidence.runs import Run, given, written
+from torchrl_ocwm.evidence.runs import Run, written
 from torchrl_ocwm.evidence.settings import Evidence
 
 IMAGE_GOALS = ", image goals"  # as evaluate.py names rows

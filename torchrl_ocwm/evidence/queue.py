@@ -18,6 +18,7 @@ from torchrl_ocwm.evidence.records import LOG, Record, commit, machine
 from torchrl_ocwm.evidence.runs import Command, Run
 from torchrl_ocwm.evidence.settings import Machine
 
+CHILD = Path(__file__).with_name("child.py")
 _LOOK, _NOTE = 0.2, 30.0  # seconds between two looks at a process, and between two notes of the time
 _PATIENCE = 120.0  # seconds that a process has to end when told to
 
@@ -61,7 +62,7 @@ def work_off(
     how: Machine,
     launcher: Launcher,
     *,
-    on_done: Callable[[Run], None] = lambda run: None,
+    on_done: Callable[[Run], None] = lambda run: None,  # noqa: ARG005
 ) -> None:
     """Do the runs that are not done, in their order as far as there is room for them.
 
@@ -137,9 +138,7 @@ def perform(job: Job, stop: Event, environment: Mapping[str, str]) -> None:
     note(done=True)
 
 
-def _run(
-    job: Job, command: Command, stop: Event, environment: Mapping[str, str], note: Callable[[], None]
-) -> None:
+def _run(job: Job, command: Command, stop: Event, environment: Mapping[str, str], note: Callable[[], None]) -> None:
     script, *arguments = command
     threads = str(job.threads)
     variables = {**os.environ, "OMP_NUM_THREADS": threads, "LP_NUM_THREADS": "0", **environment}
@@ -147,7 +146,7 @@ def _run(
         log.write(f"\n$ python examples/{' '.join(command)}\n".encode())
         log.flush()
         process = subprocess.Popen(
-            [sys.executable, "-m", "torchrl_ocwm.evidence.child", str(job.scripts / script), *arguments],
+            [sys.executable, str(CHILD), str(job.scripts / script), *arguments],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,

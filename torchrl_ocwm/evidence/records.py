@@ -92,7 +92,7 @@ class Record:
 
 
 def machine() -> str:
-    """This machine, in words.
+    """Where this runs, in words.
 
     Examples:
         >>> "cores" in machine()

@@ -120,7 +120,7 @@ class Collected(Run):
         """Simulator and image."""
         return f"collect {self.env} {image_size(self.env, self.options)}"
 
-    def commands(self, root: Path, machine: Machine) -> list[Command]:
+    def commands(self, root: Path, machine: Machine) -> list[Command]:  # noqa: ARG002
         """``collect.py``, once for each policy."""
         shared = [f"env={self.env}", *given("env.options", self.options), f"seed={self.seed}", "workers=0"]
         path, done, commands = override("dataset", self.dataset(root)), 0, []
@@ -196,9 +196,7 @@ class Explored(Run):
     def _online(self) -> Online:
         seeded = max(1, round(SEED_STEPS * self.steps))
         first = max(1, round(SEED_STEPS * self.updates))
-        return Online(
-            steps=self.steps, seed_steps=(seeded,), seed_updates=first, update_ratio=UPDATE_RATIO, workers=0
-        )
+        return Online(steps=self.steps, seed_steps=(seeded,), seed_updates=first, update_ratio=UPDATE_RATIO, workers=0)
 
     def commands(self, root: Path, machine: Machine) -> list[Command]:
         """``train_online.py``."""
@@ -243,6 +241,7 @@ class Trained(Run):
         size: Its size.
         seed: Seeds weights and sampling.
         updates: Updates.
+        episode_steps: Steps of the episodes that are played meanwhile. They decide nothing.
     """
 
     kind = "trainings"
@@ -253,6 +252,7 @@ class Trained(Run):
     size: str
     seed: int
     updates: int
+    episode_steps: int = 100
 
     @property
     def prefix(self) -> str:
@@ -286,11 +286,13 @@ class Trained(Run):
 
     def commands(self, root: Path, machine: Machine) -> list[Command]:
         """``train_offline.py``."""
-        evaluation = {"eval_interval": max(1, self.updates // EVALUATIONS), "eval_episodes": LANDMARKS}
-        settings = {
-            **{"seed": self.seed, "updates": self.updates, **evaluation},
-            **{"video_interval": 0, "threads": machine.threads, "device": machine.device},
+        evaluation = {
+            "eval_interval": -(-self.updates // EVALUATIONS),
+            "eval_episodes": LANDMARKS,
+            "eval_steps": self.episode_steps,
         }
+        learning = {"seed": self.seed, "updates": self.updates, "video_interval": 0}
+        settings = {**learning, **evaluation, "threads": machine.threads, "device": machine.device}
         return [
             (
                 "train_offline.py",
@@ -363,15 +365,15 @@ class Evaluated(Run):
         """The agent."""
         return (self.trained,)
 
-    def commands(self, root: Path, machine: Machine) -> list[Command]:
+    def commands(self, root: Path, machine: Machine) -> list[Command]:  # noqa: ARG002
         """``evaluate.py``."""
         settings = [f"{name}={written(value)}" for name, value in self._settings.items()]
         checkpoint = override("checkpoint", root / self.trained.name / CHECKPOINT)
         output = override("output", root / self.name)
         return [("evaluate.py", checkpoint, output, *settings, "workers=0", "envs=10", "video_goals=0")]
 
-    def reached(self, root: Path) -> int:
-        """It is not known."""
+    def reached(self, root: Path) -> int:  # noqa: ARG002
+        """An evaluation begins anew."""
         return 0
 
 
@@ -391,7 +393,7 @@ def essential(content: Any) -> Any:
     if not is_dataclass(content):
         return content
     known = content.name_and_kind() if isinstance(content, Settings) else None
-    name = {} if known is None else {"name": known[0]}
+    name: dict[str, Any] = {} if known is None else {"name": known[0]}
     values = {one.name: getattr(content, one.name) for one in fields(content) if not _is_default(content, one)}
     return {**name, **{name: essential(value) for name, value in values.items()}}
 
@@ -434,11 +436,11 @@ def written(value: Any) -> str:
 
 
 def override(name: str, path: Path) -> str:
-    """A path as a command line has it, whatever letters are in it.
+    r"""A path as a command line has it, whatever letters are in it.
 
     Examples:
         >>> print(override("output", Path("what's/a=b")))
-        output='what\\'s/a=b'
+        output='what\'s/a=b'
     """
     text = str(path).replace("'", "\\'")
     return f"{name}='{text}'"

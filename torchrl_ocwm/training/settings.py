@@ -27,7 +27,7 @@ class Training(Settings):
         log_interval: Updates between two lines of the log, over which losses are averaged.
         checkpoint_interval: Updates between two checkpoints.
         eval_interval: Updates between two evaluations; 0 for none.
-        eval_episodes: Episodes per evaluation, one to each of the task's first landmark goals.
+        eval_episodes: Episodes per evaluation, to as many of the task's landmark goals, drawn anew each time.
         eval_steps: Steps per episode.
         video_interval: Updates between two open-loop prediction videos; 0 for none.
         goals: Goals of the sampled sequences: ``"uniform"`` draws a fresh one for each, ``"stored"`` keeps those of the
