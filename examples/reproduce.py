@@ -48,7 +48,8 @@ def main(config: Reproduce) -> None:
     runs = in_order(one.evaluated for one in wanted)
     root = Path(config.output).absolute()
     launcher = LAUNCHERS[config.launcher](config)
-    print(table(forecast(runs, root, config), launcher.slots), flush=True)
+    rows = {run.name: one.row.name for one in wanted for run in (one.evaluated, one.evaluated.trained)}
+    print(table(forecast(runs, root, config), launcher.slots, rows), flush=True)
     if config.dry_run:
         return
     root.mkdir(parents=True, exist_ok=True)

@@ -7,7 +7,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-
 from torchrl.modules import SymExpTwoHot
 
 from torchrl_ocwm.agents import build_agent

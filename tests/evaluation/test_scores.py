@@ -188,8 +188,10 @@ class TestIntervals:
 
     def test_a_slow_version(self) -> None:
         values = torch.rand(3, 7)
-        rows = [[column[int(index)] for column in values.T.tolist() for index in torch.randint(3, (3,))]
-                for _ in range(4000)]
+        rows = [
+            [column[int(index)] for column in values.T.tolist() for index in torch.randint(3, (3,))]
+            for _ in range(4000)
+        ]
         means = torch.tensor([sum(sorted(row)[5:16]) / 11 for row in rows])
         expected = means.quantile(torch.tensor([0.025, 0.975])).tolist()
         assert bootstrap_interval(values) == pytest.approx(expected, abs=0.02)

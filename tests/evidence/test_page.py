@@ -78,7 +78,6 @@ def work(command: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path:
 @pytest.mark.slow
 @pytest.mark.parametrize("figure", ["table", "visual_goals"])
 def test_a_whole_figure(figure: str, work: Callable[..., list[str]], tmp_path: Path) -> None:
-    """Of all agents; then of another figure, which shares runs with it."""
     wanted = Evidence(figure=figure, size="debug", seeds=1, steps=40, updates=2, goals=1)
     found = results(wanted)
     agents = len(FIGURES[figure].rows)
@@ -105,7 +104,7 @@ def test_a_whole_figure(figure: str, work: Callable[..., list[str]], tmp_path: P
     returns = report.rows[names[0]].seeds[0]
     if figure == "table":  # Dreamer has a critic of the environment's rewards
         assert returns["obtained_return"].item() < 0
-        assert returns["predicted_return"].item() == 0  # an untaught critic starts at zero, and was taught by two updates
+        assert abs(returns["predicted_return"].item()) < 1e-3  # a critic starts at zero
         assert "predicted_return" not in report.rows["focus_lcp"].seeds[0]
 
 

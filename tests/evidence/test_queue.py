@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -136,10 +136,17 @@ def test_a_run_that_fails_keeps_back_only_those_that_need_it(work: Callable[...,
     assert "stub.py" in (tmp_path / bad.name / "log.txt").read_text()
 
 
-def test_several_at_a_time(tmp_path: Path, scripts_folder: Path) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["local", "ray"])
+def test_several_at_a_time(
+    launcher: Literal["local", "ray"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scripts_folder: Path
+) -> None:
     """Two that wait for ever are both at work."""
-    runs, how = [Stub(title=title, what="wait") for title in ("one", "two", "three")], Machine(workers=2)
-    launcher = LAUNCHERS["local"](how)
+    if launcher == "ray":
+        pytest.importorskip("ray")
+    runs = [Stub(title=title, what="wait") for title in ("one", "two", "three")]
+    how = Machine(launcher=launcher, workers=2)
+    where = LAUNCHERS[launcher](how)
 
     class Enough(BaseException):
         pass
@@ -148,9 +155,9 @@ def test_several_at_a_time(tmp_path: Path, scripts_folder: Path) -> None:
         assert wait_until(lambda: len(begun(tmp_path)) == 2)
         raise Enough
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Enough):
-        patch.setattr("torchrl_ocwm.evidence.queue.wait", watch)
-        work_off(runs, tmp_path, scripts_folder, how, launcher)
+    monkeypatch.setattr("torchrl_ocwm.evidence.queue.wait", watch)
+    with pytest.raises(Enough):
+        work_off(runs, tmp_path, scripts_folder, how, where)
     # Whatever ends the queue tells its processes to end, and waits for them.
     assert sorted(begun(tmp_path)) == ["one", "two"]
     assert {file.name for file in tmp_path.glob("*.stopped")} == {"one.stopped", "two.stopped"}

@@ -43,7 +43,7 @@ def test_other_data_make_another_agent_and_other_scores(other: Collected) -> Non
 
 
 @pytest.mark.parametrize(
-    "change",
+    "other",
     [
         {"agent": "dreamer_pcp"},
         {"changes": {"world_model.lambda_goal_position": 200}},
@@ -52,13 +52,13 @@ def test_other_data_make_another_agent_and_other_scores(other: Collected) -> Non
         {"updates": 5},
     ],
 )
-def test_another_training(change: dict[str, Any]) -> None:
-    assert replace(TRAINED, **change).name != TRAINED.name
+def test_another_training(other: dict[str, Any]) -> None:
+    assert replace(TRAINED, **other).name != TRAINED.name
 
 
 def test_another_evaluation() -> None:
-    for change in ({"goals": 9}, {"episode_steps": 4}, {"image_goals": True}, {"random": True}):
-        assert replace(EVALUATED, **change).name != EVALUATED.name
+    for other in ({"goals": 9}, {"episode_steps": 4}, {"image_goals": True}, {"random": True}):
+        assert replace(EVALUATED, **other).name != EVALUATED.name
 
 
 def test_the_same_settings_said_otherwise_are_the_same_run() -> None:

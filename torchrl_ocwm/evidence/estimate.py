@@ -58,10 +58,18 @@ def _forecast(run: Run, root: Path, paces: Paces) -> Forecast:
     return Forecast(run, f"{reached:,} of {run.work:,}" if reached else "to do", seconds, False)
 
 
-def table(forecasts: Sequence[Forecast], slots: int) -> str:
-    """The runs, their states and times, and the time for all."""
-    lines = ["| run | state | time |", "|---|---|---|"]
-    lines += [f"| {one.run.name} | {one.state} | {in_words(one.seconds)} |" for one in forecasts]
+def table(forecasts: Sequence[Forecast], slots: int, rows: Mapping[str, str]) -> str:
+    """The runs, their states and times, and the time for all.
+
+    Args:
+        forecasts: Of the runs.
+        slots: How many are done at a time.
+        rows: Names of runs → rows of the figure that they are for.
+    """
+    lines = ["| run | for | state | time |", "|---|---|---|---|"]
+    for one in forecasts:
+        row, time_there = rows.get(one.run.name, "all"), in_words(one.seconds)
+        lines.append(f"| {one.run.name} | {row} | {one.state} | {time_there} |")
     left = [one.seconds for one in forecasts if not one.done]
     if not left:
         return "\n".join([*lines, "", f"All {len(forecasts)} runs are done."])
@@ -114,8 +122,11 @@ class Paces:
         assert isinstance(run, (Trained, Evaluated))
         trained = run.trained if isinstance(run, Evaluated) else run
         task = make_task(trained.data.env, **trained.data.options)
+        acting = seconds_of_acting(_agent(task, trained.agent, trained.size, trained.changes))
+        if isinstance(run, Evaluated):
+            return acting
         agent = _agent(task, trained.agent, trained.size, trained.changes)
-        return seconds_of_acting(agent) if isinstance(run, Evaluated) else seconds_of_an_update(agent, self.how)
+        return seconds_of_an_update(agent, self.how) + acting * run.steps_played / run.updates
 
 
 def seconds_of_an_update(agent: Agent, how: Machine) -> float:

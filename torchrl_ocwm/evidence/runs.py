@@ -275,6 +275,15 @@ class Trained(Run):
         return self.updates
 
     @property
+    def steps_played(self) -> int:
+        """Steps of the episodes that are played meanwhile."""
+        return self.updates // self._eval_interval * LANDMARKS * self.episode_steps
+
+    @property
+    def _eval_interval(self) -> int:
+        return -(-self.updates // EVALUATIONS)
+
+    @property
     def pace(self) -> str:
         """Row, size and image."""
         return f"train {self.agent} {self.size} {image_size(self.data.env, self.data.options)}"
@@ -287,7 +296,7 @@ class Trained(Run):
     def commands(self, root: Path, machine: Machine) -> list[Command]:
         """``train_offline.py``."""
         evaluation = {
-            "eval_interval": -(-self.updates // EVALUATIONS),
+            "eval_interval": self._eval_interval,
             "eval_episodes": LANDMARKS,
             "eval_steps": self.episode_steps,
         }
