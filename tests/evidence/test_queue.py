@@ -49,6 +49,7 @@ class Stub(Run):
 
     title: str
     what: str = "end"
+    does: int = 1
     after: tuple[Run, ...] = ()
 
     @property
@@ -75,7 +76,7 @@ class Stub(Run):
         return [("stub.py", str(root / "order"), self.title, self.what)]
 
     def reached(self, root: Path) -> int:
-        return 0
+        return self.does
 
 
 @pytest.fixture
@@ -134,6 +135,14 @@ def test_a_run_that_fails_keeps_back_only_those_that_need_it(work: Callable[...,
     assert message.endswith("log.txt)")
     assert not Record.of(bad, tmp_path).done
     assert "stub.py" in (tmp_path / bad.name / "log.txt").read_text()
+
+
+def test_a_run_that_has_ended_early_is_not_done(work: Callable[..., list[str]], tmp_path: Path) -> None:
+    """As a training does that others tell to end: it says that all is well."""
+    with pytest.raises(RunFailedError, match=r"ended after 0 of 1; run the same command again"):
+        work(Stub(title="short", does=0))
+    assert not Record.of(Stub(title="short"), tmp_path).done
+    assert work(Stub(title="short")) == ["short", "short"]
 
 
 @pytest.mark.slow

@@ -125,6 +125,9 @@ def test_how_far_a_run_is(tmp_path: Path) -> None:
     assert TRAINED.reached(tmp_path) == 0  # without a checkpoint it begins anew
     (tmp_path / TRAINED.name / "checkpoint.zip").touch()
     assert TRAINED.reached(tmp_path) == 3
+    (tmp_path / EVALUATED.name).mkdir(parents=True)
+    (tmp_path / EVALUATED.name / "results.json").touch()
+    assert EVALUATED.reached(tmp_path) == EVALUATED.work
 
 
 def test_work() -> None:

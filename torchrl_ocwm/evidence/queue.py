@@ -32,18 +32,25 @@ class Job:
     """A run with all that is needed to do it, also on another machine.
 
     Args:
-        folder: Of the run.
+        run: The run.
+        root: Folder of all runs.
         commands: What does it.
         record: What is known of it so far.
         scripts: Folder of the scripts.
         threads: Threads of each process.
     """
 
-    folder: Path
+    run: Run
+    root: Path
     commands: Sequence[Command]
     record: Record
     scripts: Path
     threads: int
+
+    @property
+    def folder(self) -> Path:
+        """Of the run."""
+        return self.root / self.run.name
 
 
 def in_order(runs: Iterable[Run]) -> list[Run]:
@@ -89,7 +96,7 @@ def work_off(
             while len(at_work) < launcher.slots and (run := _next(left, done)):
                 left.remove(run)
                 commands = run.commands(root, how)
-                job = Job(root / run.name, commands, records[run.name], scripts, how.threads)
+                job = Job(run, root, commands, records[run.name], scripts, how.threads)
                 at_work[launcher.submit(perform, job)] = run
             if not at_work:
                 break
@@ -120,7 +127,7 @@ def perform(job: Job, stop: Event, environment: Mapping[str, str]) -> None:
         environment: Variables of the processes, beside those of this one.
 
     Raises:
-        RunFailedError: if a command fails or is stopped.
+        RunFailedError: if a command fails or is stopped, or ends before all is done.
     """
     job.folder.mkdir(parents=True, exist_ok=True)
     record = replace(job.record, commands=tuple(job.commands), commit=commit(job.scripts), machine=machine())
@@ -132,6 +139,7 @@ def perform(job: Job, stop: Event, environment: Mapping[str, str]) -> None:
     try:
         for command in job.commands:
             _run(job, command, stop, environment, note)
+        _check_end(job)
     except BaseException:
         note()
         raise
@@ -161,6 +169,13 @@ def _run(job: Job, command: Command, stop: Event, environment: Mapping[str, str]
         raise RunFailedError(f"{job.folder}: stopped")
     if process.returncode:
         raise RunFailedError(f"{job.folder} ({_last_line(job.folder / LOG)}; all of it: {job.folder / LOG})")
+
+
+def _check_end(job: Job) -> None:
+    """A training that somebody else has told to end has left a checkpoint, and says that all is well."""
+    reached = job.run.reached(job.root)
+    if reached < job.run.work:
+        raise RunFailedError(f"{job.folder} (ended after {reached:,} of {job.run.work:,}; run the same command again)")
 
 
 def _watch(process: subprocess.Popen[bytes], stop: Event, note: Callable[[], None]) -> None:

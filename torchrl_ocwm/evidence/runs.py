@@ -68,7 +68,7 @@ class Run(ABC):
 
     @abstractmethod
     def reached(self, root: Path) -> int:
-        """How much of the work is done, before all of it is."""
+        """How much of the work is done, as far as its files say."""
 
     @cached_property
     def name(self) -> str:
@@ -381,9 +381,9 @@ class Evaluated(Run):
         output = override("output", root / self.name)
         return [("evaluate.py", checkpoint, output, *settings, "workers=0", "envs=10", "video_goals=0")]
 
-    def reached(self, root: Path) -> int:  # noqa: ARG002
-        """An evaluation begins anew."""
-        return 0
+    def reached(self, root: Path) -> int:
+        """All or nothing: an evaluation begins anew."""
+        return self.work if (root / self.name / "results.json").exists() else 0
 
 
 def essential(content: Any) -> Any:
