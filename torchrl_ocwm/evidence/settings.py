@@ -18,7 +18,7 @@ class Evidence(Settings):
         figure: Which of the paper's tables and figures.
         env: Environment, or list of them.
         size: Size of the agents. It also says how many steps, updates and goals there are.
-        seeds: Runs of each row: seeds 0, 1, 2, …
+        seeds: Runs of each row, with the seeds 0, 1, 2 and so on.
         steps: Environment steps of each dataset; ``None``: as many as go with the size.
         updates: Updates of each run; ``None``: as many as go with size and environment.
         goals: Goals of each evaluation, a square grid; ``None``: as many as go with the size.

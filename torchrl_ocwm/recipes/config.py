@@ -58,9 +58,9 @@ def recipe(
             with _user_errors():
                 store_options()
                 _check_choices(groups or {}, sys.argv[1:])
-            _forget_groups(GROUPS - set(groups or {}))
             ConfigStore.instance().store(name, _schema(kind, groups or {}, more))
-            hydra.main(version_base="1.3", config_path=None, config_name=name)(guarded)()
+            with _without(GROUPS - set(groups or {})):
+                hydra.main(version_base="1.3", config_path=None, config_name=name)(guarded)()
 
         return main
 
@@ -83,10 +83,15 @@ def store_options() -> None:
         store.store(name, {"name": name, "options": defaults(environment.options)}, group="env")
 
 
-def _forget_groups(groups: Iterable[str]) -> None:
-    """Let a recipe without some groups have plain settings of their names."""
-    for group in groups:
-        ConfigStore.instance().repo.pop(group, None)
+@contextmanager
+def _without(groups: Iterable[str]) -> Iterator[None]:
+    """Let a recipe that takes no such groups have plain settings of their names."""
+    repo = ConfigStore.instance().repo
+    aside = {group: repo.pop(group) for group in groups if group in repo}
+    try:
+        yield
+    finally:
+        repo.update(aside)
 
 
 def _check_choices(groups: Iterable[str], arguments: Iterable[str]) -> None:
