@@ -34,6 +34,11 @@ def end(number, frame):
 signal.signal(signal.SIGTERM, end)
 with order.open("a") as file:
     file.write(name + "\\n")
+if what == "nap":
+    time.sleep(1)
+    order.with_name(name + ".slept").touch()
+if what == "slept":
+    sys.exit(not order.with_name("data.slept").exists())
 if what == "fail":
     sys.exit(f"{name} cannot be done")
 if what == "wait" and not order.with_name(name + ".stopped").exists():
@@ -121,6 +126,11 @@ def test_what_is_needed_is_done_first_and_nothing_twice(work: Callable[..., list
     assert record.commands == [["stub.py", str(tmp_path / "order"), "last", "end"]]
     assert work(last, second) == ["data", "first", "last", "second"]
     assert work(last, Stub(title="new", after=(second,)))[4:] == ["new"]
+
+
+def test_what_needs_another_waits_for_it_where_there_is_room(work: Callable[..., list[str]]) -> None:
+    data = Stub(title="data", what="nap")
+    assert work(Stub(title="agent", what="slept", after=(data,)), Stub(title="free"), workers=3)[2] == "agent"
 
 
 def test_a_run_that_fails_keeps_back_only_those_that_need_it(work: Callable[..., list[str]], tmp_path: Path) -> None:
