@@ -40,6 +40,7 @@ from torchrl_ocwm.evaluation import (
     measure,
     object_errors,
     picture_objects,
+    predicted_return,
     tile,
     write_video,
 )
@@ -204,6 +205,10 @@ def _evaluate(
             object_index=policy.object_index,
             seed=seed,
         )
+    if "reward_head" in policy.behaviour.config.reward.needs:  # which learns the rewards of the environment
+        gamma, reward = policy.agent.size.learning.gamma, episodes["reward"].squeeze(-1)
+        errors["predicted_return"] = predicted_return(policy.behaviour, episodes["latent"][:, 0])
+        errors["obtained_return"] = (reward * gamma ** torch.arange(reward.shape[1])).sum(1)
     return {**measure(episodes, object_index=policy.object_index), **errors}
 
 

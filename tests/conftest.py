@@ -26,7 +26,11 @@ from torchrl_ocwm.testing import random_records, reacher_task
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 #: What a command of a recipe has to say, whatever else it says.
-REQUIRED = {"evaluate": ["checkpoint=a.zip"], "diagnose": ["checkpoint=a.zip", "dataset=data"]}
+REQUIRED = {
+    "evaluate": ["checkpoint=a.zip"],
+    "diagnose": ["checkpoint=a.zip", "dataset=data"],
+    "reproduce": ["figure=table"],
+}
 
 # A shell that runs the tests in the background lets them, and what they start, ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -108,7 +112,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def scripts() -> dict[str, ModuleType]:
     """The scripts of the recipes as modules: to run one here saves the seconds that a process takes to start."""
     modules = {}
-    for name in ("collect", "train_offline", "train_online", "evaluate", "diagnose"):
+    for name in ("collect", "train_offline", "train_online", "evaluate", "diagnose", "reproduce"):
         spec = spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
         assert spec is not None
         assert spec.loader is not None

@@ -112,4 +112,4 @@ def below(kind: type) -> Iterator[type]:
 def recipes_of(kind: type) -> set[str]:
     """The settings classes of recipes below a class, which have its settings too."""
     text = "".join(script.read_text() for script in (ROOT / "examples").glob("*.py"))
-    return set(re.findall(rf"class (\w+)\({kind.__name__}\)", text))
+    return set(re.findall(rf"class (\w+)\([^)]*\b{kind.__name__}\b[^)]*\)", text))

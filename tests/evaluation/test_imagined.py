@@ -7,9 +7,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torchrl.modules import SymExpTwoHot
 
-from torchrl_ocwm.evaluation import imagined_distance, imagined_rollout
+from torchrl_ocwm.agents import build_agent
+from torchrl_ocwm.evaluation import imagined_distance, imagined_rollout, predicted_return
 from torchrl_ocwm.modules import ImaginationEnv, WorkspaceUnits
+from torchrl_ocwm.testing import reacher_task
 
 STATE, BELIEF = ("latent", "state"), ("latent", "belief")
 
@@ -59,3 +62,19 @@ def test_agents_act_without_exploration(make_agent: Any) -> None:
     first, second = (imagined_rollout(agent, latent, 5)["action"][:, 0] for _ in range(2))
     torch.testing.assert_close(first, second)
     assert imagined_distance(agent, latent, torch.zeros(3, 2), 5).shape == (3,)
+
+
+def test_the_predicted_return_is_the_critics_value() -> None:
+    """A critic that is sure of one bin says its value, and what is predicted follows the critic's own parameters."""
+    behaviour = build_agent("dreamer", reacher_task(), "debug").behaviour()
+    sizes = {"state": 16, "belief": 16, "goal": 3}
+    latent = TensorDict({name: torch.rand(4, size) for name, size in sizes.items()}, [4])
+    torch.testing.assert_close(predicted_return(behaviour, latent), torch.zeros(4))
+    bins = SymExpTwoHot().num_bins
+    [bias] = [one for one in behaviour.loss.value_loss.value_model_params.parameters() if one.shape == (bins,)]
+    logits = torch.zeros(bins)
+    logits[100] = 1e4
+    bias.data.copy_(logits)
+    expected = SymExpTwoHot()(logits.unsqueeze(0)).squeeze()
+    assert abs(expected) > 1e-3
+    torch.testing.assert_close(predicted_return(behaviour, latent), expected.expand(4))

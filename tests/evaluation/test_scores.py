@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_ocwm.evaluation import Report, mean_and_error, measure, normalized_score
+from torchrl_ocwm.evaluation.scores import bootstrap_interval, interquartile_mean
 
 
 def test_normalized_score_by_hand() -> None:
@@ -156,3 +157,46 @@ class TestReport:
         report = Report.load(tmp_path / "results.json")
         assert report.rows["dreamer"].runs == ["a", "b"]
         assert report.summary("dreamer", "final_score") == (pytest.approx(0.6), pytest.approx(0.1))
+
+
+class TestIntervals:
+    @pytest.mark.parametrize("number", [1, 3, 4, 5, 10, 299])
+    def test_interquartile_mean(self, number: int) -> None:
+        """As `scipy.stats.trim_mean(values, 0.25)` has it."""
+        values = torch.randn(number)
+        cut = int(0.25 * number)
+        expected = sum(sorted(values.tolist())[cut : number - cut]) / (number - 2 * cut)
+        assert interquartile_mean(values).item() == pytest.approx(expected, abs=1e-6)
+        torch.testing.assert_close(interquartile_mean(values.expand(3, -1)), torch.full((3,), expected))
+
+    def test_a_single_seed_has_no_interval(self) -> None:
+        assert bootstrap_interval(torch.rand(1, 100)) is None
+
+    def test_closed_form(self) -> None:
+        """One goal, two seeds, 0 and 1: resamples have the means 0, 0.5 and 1 in the shares 1 : 2 : 1."""
+        values = torch.tensor([[0.0], [1.0]])
+        assert bootstrap_interval(values, share=0.95) == (0, 1)
+        assert bootstrap_interval(values, share=0.4) == (0.5, 0.5)
+
+    def test_many_goals(self) -> None:
+        """Means of many goals are normal: those of 400 goals, 0.5 +- 1.96 * 0.5 / sqrt(2 * 400) after trimming."""
+        values = torch.stack([torch.zeros(400), torch.ones(400)])
+        shares = torch.distributions.Binomial(800, torch.tensor(0.5)).sample((20_000,)) / 800
+        # With zeros and ones alone, the middle half is that of the share of ones, stretched twice around one half.
+        expected = (2 * (shares - 0.5) + 0.5).clamp(0, 1).quantile(torch.tensor([0.025, 0.975])).tolist()
+        assert bootstrap_interval(values) == pytest.approx(expected, abs=0.01)
+
+    def test_a_slow_version(self) -> None:
+        values = torch.rand(3, 7)
+        rows = [
+            [column[int(index)] for column in values.T.tolist() for index in torch.randint(3, (3,))]
+            for _ in range(4000)
+        ]
+        means = torch.tensor([sum(sorted(row)[5:16]) / 11 for row in rows])
+        expected = means.quantile(torch.tensor([0.025, 0.975])).tolist()
+        assert bootstrap_interval(values) == pytest.approx(expected, abs=0.02)
+
+    def test_goals_are_strata(self) -> None:
+        """Where seeds agree on each goal, the interval has no width, however much goals differ."""
+        low, high = bootstrap_interval(torch.rand(5).repeat(4, 1)) or (0.0, 1.0)
+        assert low == pytest.approx(high)

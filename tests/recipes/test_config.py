@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from torchrl_ocwm.agents import AGENTS, SIZES, Adam, LatentSimilarity, ObjectCentric, StateEntropy
@@ -318,6 +319,13 @@ class TestHydra:
     def test_keeps_what_it_ran_with(self, tmp_path: Path) -> None:
         keep_settings(Training(updates=3), tmp_path / "run")
         assert OmegaConf.load(tmp_path / "run" / "config.yaml") == to_dict(Training(updates=3))
+
+
+def test_groups_that_a_recipe_does_not_take_are_plain_settings_in_it(compose: Callable[..., Any]) -> None:
+    """And groups again in the next one."""
+    assert compose("reproduce", "size=debug", "env=[reacher,cube_move]").env == ("reacher", "cube_move")
+    assert compose("train_offline", "size=debug", "env=cube_move").env.name == "cube_move"
+    assert {"agent", "explore", "size", "env"} <= set(ConfigStore.instance().repo)
 
 
 def kinds(base: type = Settings) -> Iterator[type]:

@@ -20,6 +20,7 @@ from torchrl_ocwm.envs.positioning import NoScriptedPolicyError, SimulationDiver
 from torchrl_ocwm.errors import MissingPackageError, UserError
 from torchrl_ocwm.evaluation.output import OutputError
 from torchrl_ocwm.evaluation.report import ReportError
+from torchrl_ocwm.evidence import RecordError, RunFailedError
 from torchrl_ocwm.files import FolderInUseError, only_writer
 from torchrl_ocwm.parts import load_plugins
 from torchrl_ocwm.processes import WorkerError
@@ -40,8 +41,10 @@ KINDS = {
     MissingPackageError: ModuleNotFoundError,
     NoScriptedPolicyError: NotImplementedError,
     OutputError: RuntimeError,
+    RecordError: ValueError,
     RenderingError: RuntimeError,
     ReportError: ValueError,
+    RunFailedError: RuntimeError,
     SettingsError: ValueError,
     SimulationDivergedError: RuntimeError,
     SystemLibraryError: ImportError,

@@ -287,7 +287,9 @@ def test_evaluations_while_training(train: Callable[..., str], episodes: list[di
     assert "checkpoint: run/checkpoint.zip" in train(*settings, "output=run")
     assert len(episodes) == 2
     assert episodes[0]["episode_steps"] == 7
-    torch.testing.assert_close(episodes[0]["goals"], torch.tensor(POINTS[:3]))
+    goals = [tuple(round(x, 6) for x in goal) for goal in episodes[0]["goals"].tolist()]
+    assert len(set(goals)) == 3
+    assert set(goals) <= set(POINTS)
 
 
 @shows("Training.eval_beside")

@@ -16,7 +16,7 @@ from torchrl_ocwm.evaluation.episodes import (
     transition,
 )
 from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
-from torchrl_ocwm.evaluation.imagined import imagined_distance, imagined_rollout
+from torchrl_ocwm.evaluation.imagined import imagined_distance, imagined_rollout, predicted_return
 from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation
 from torchrl_ocwm.evaluation.objects import object_errors
 from torchrl_ocwm.evaluation.open_loop import random_sequences
@@ -29,7 +29,7 @@ from torchrl_ocwm.lazy import lazily
 
 if TYPE_CHECKING:
     from torchrl_ocwm.evaluation.object_pictures import draw_errors, draw_goal_latents, picture_objects
-    from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, save_figure
+    from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, metric_lines, save_figure
     from torchrl_ocwm.evaluation.videos import OpenLoopFilm, check_ffmpeg, decode_video, mark, tile, write_video
 
 __all__ = [
@@ -56,9 +56,11 @@ __all__ = [
     "match",
     "mean_and_error",
     "measure",
+    "metric_lines",
     "normalized_score",
     "object_errors",
     "picture_objects",
+    "predicted_return",
     "random_sequences",
     "save_figure",
     "tile",
@@ -80,6 +82,7 @@ __getattr__ = lazily(
         "heatmap": "plots",
         "learning_curves": "plots",
         "mark": "videos",
+        "metric_lines": "plots",
         "picture_objects": "object_pictures",
         "save_figure": "plots",
         "tile": "videos",

@@ -69,3 +69,20 @@ def imagined_distance(
     last = imagined_rollout(agent, latent, steps + 1, seed=seed)[:, -1].select("latent")
     decoded = agent.model.object_position()(last)["object_units"].unflatten(-1, (-1, agent.model.units.dim))
     return torch.linalg.vector_norm(agent.model.units.to_metres(decoded[:, object_index]) - goals, dim=-1)
+
+
+@torch.no_grad()
+def predicted_return(behaviour: LearntBehaviour, latent: TensorDictBase) -> Tensor:
+    """What a behaviour's critic expects, without a rollout: the discounted sum of all rewards from here on.
+
+    Args:
+        behaviour: The behaviour.
+        latent: ``[N]``, as for :func:`imagined_rollout`.
+
+    Returns:
+        ``[N]``, in the unit of the rewards.
+    """
+    value = behaviour.loss.value_loss
+    here = TensorDict({"latent": latent.select("state", "belief", "goal", strict=False)}, latent.batch_size)
+    with value.value_model_params.to_module(value.value_model):
+        return value.value_model(here)["state_value"].squeeze(-1)

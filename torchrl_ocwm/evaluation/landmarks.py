@@ -26,15 +26,15 @@ class LandmarkEvaluation:
 
     An agent that takes goals as images only is given images of them.
 
-    The paper draws its training curves with ten such goals. The environments are made at the first call and kept until
-    it is closed.
+    The paper draws its training curves with episodes to random ones of ten such goals. The environments are made at the
+    first call and kept until it is closed.
 
     TorchRL's ``Evaluator`` also evaluates in a process of its own. It has no starts and no random numbers that belong
     to a goal, so its scores would not be those of :class:`EvaluationEnvs`.
 
     Args:
         agent: The agent in training.
-        episodes: Episodes, one to each of the first landmarks.
+        episodes: Episodes, to as many of the landmarks, drawn anew at each call.
         episode_steps: Steps of each.
         beside: Evaluate a copy of the weights in a process of its own, on the CPU. It starts at once.
 
@@ -46,22 +46,23 @@ class LandmarkEvaluation:
         task, landmarks = agent.task, agent.task.workspace.landmarks
         if episodes > len(landmarks):
             raise SettingsError(f"eval_episodes={episodes}, but {task.name} has {len(landmarks)} landmark goals")
-        self.policy, self.goals, self.beside = agent.policy(), torch.tensor(landmarks[:episodes]), beside
-        index = self.policy.object_index
+        self.policy, self.goals, self.episodes = agent.policy(), torch.tensor(landmarks), episodes
+        self.beside, index = beside, self.policy.object_index
         images = None if self.policy.takes_positions else goal_images(task, self.goals, object_index=index)
         # Without the agent that a policy knows.
         acts = deepcopy(TensorDictSequential(*self.policy.module)).cpu() if beside else self.policy
         make = partial(LandmarkEpisodes, acts, find_environment(task.name), task, self.goals, images, index)
-        self._worker: Worker = make_worker(partial(make, episode_steps), process=beside, timeout=_TIMEOUT)
+        self._worker: Worker = make_worker(partial(make, episode_steps, episodes), process=beside, timeout=_TIMEOUT)
         self._is_ready = False
 
-    def __call__(self, updates: int) -> dict[str, float] | Worker:  # noqa: ARG002
-        """Scores to log, or what will answer with them."""
+    def __call__(self, updates: int) -> dict[str, float] | Worker:
+        """Scores to log, or what will answer with them; the number of updates decides which landmarks are drawn."""
         if not self._is_ready:
             self._worker.ready()
             self._is_ready = True
+        drawn = torch.randperm(len(self.goals), generator=torch.Generator().manual_seed(updates))
         weights = {name: value.cpu() for name, value in self.policy.state_dict().items()} if self.beside else None
-        self._worker.request("scores", weights)
+        self._worker.request("scores", weights, drawn[: self.episodes].sort().values)
         return self._worker if self.beside else self._worker.answer()
 
     def close(self) -> None:
@@ -86,6 +87,7 @@ class LandmarkEpisodes:
         images: ``[N, 3, H, W]`` uint8, what the policy is given instead.
         object_index: Which object is to go there.
         episode_steps: Steps of an episode.
+        episodes: Episodes at a time.
         alive: Called after each step.
     """
 
@@ -98,19 +100,22 @@ class LandmarkEpisodes:
         images: Tensor | None,
         object_index: int,
         episode_steps: int,
+        episodes: int,
         alive: Callable[[], None],
     ) -> None:
         ENVIRONMENTS.setdefault(environment.name, environment)
         self.policy, self.goals, self.images, self.object_index = policy, goals, images, object_index
-        self.envs = EvaluationEnvs(task, episode_steps=episode_steps, workers=0, envs=len(goals))
+        self.envs = EvaluationEnvs(task, episode_steps=episode_steps, workers=0, envs=episodes)
         self.alive = alive
 
-    def scores(self, weights: dict[str, Tensor] | None) -> dict[str, float]:
-        """Means over the goals, with these weights of the policy if they are given."""
+    def scores(self, weights: dict[str, Tensor] | None, chosen: Tensor) -> dict[str, float]:
+        """Means over the goals of these numbers ``[E]``, with these weights of the policy if they are given."""
         if weights is not None:
             assert isinstance(self.policy, torch.nn.Module)
             self.policy.load_state_dict(weights)
-        scores = measure(self.envs.run(self._act, self.goals, images=self.images), object_index=self.object_index)
+        images = None if self.images is None else self.images[chosen]
+        episodes = self.envs.run(self._act, self.goals[chosen], images=images, numbers=chosen)
+        scores = measure(episodes, object_index=self.object_index)
         return {f"evaluation/{name}": float(values.nanmean()) for name, values in scores.items()}
 
     def _act(self, step: TensorDictBase) -> TensorDictBase:

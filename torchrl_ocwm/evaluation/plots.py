@@ -67,6 +67,29 @@ def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict
     save_figure(figure, path)
 
 
+def metric_lines(
+    path: str | Path, lines: dict[str, dict[str, dict[str, tuple[float, float | None] | None]]], places: str
+) -> None:
+    """Draw how metrics change from one place of a line to the next, one panel per metric.
+
+    Args:
+        path: PNG file to write.
+        lines: Metric → line → place → mean and error, ``None`` where there is nothing.
+        places: What the places are.
+    """
+    figure, axes = _panels(len(lines), columns=4, width=4.2, height=3.2)
+    for axis, (metric, found) in zip(axes, lines.items(), strict=True):
+        for name, points in found.items():
+            there = {place: pair for place, pair in points.items() if pair is not None}
+            means = [mean for mean, _ in there.values()]
+            axis.errorbar(list(there), means, [error or 0 for _, error in there.values()], label=name, marker="o")
+        axis.set_xlabel(places)
+        axis.set_ylabel(metric)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize="small")
+    save_figure(figure, path)
+
+
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a picture, and forget it.
 

@@ -13,7 +13,12 @@ from torch import Tensor
 
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
-from torchrl_ocwm.evaluation.scores import mean_and_error, score_is_undefined
+from torchrl_ocwm.evaluation.scores import (
+    bootstrap_interval,
+    interquartile_mean,
+    mean_and_error,
+    score_is_undefined,
+)
 
 #: Metric → column of the table and digits after the point.
 COLUMNS = {
@@ -24,7 +29,11 @@ COLUMNS = {
     "imagined_distance": ("final distance as imagined, m", 3),
     "entity_error": ("entity reconstruction error, m", 3),
     "goal_error": ("goal reconstruction error, m", 3),
+    "predicted_return": ("return predicted at the start", 2),
+    "obtained_return": ("return obtained", 2),
 }
+#: The metric that also gets an interval.
+SCORE = "final_score"
 
 
 class ReportError(UserError, ValueError):
@@ -154,15 +163,31 @@ class Report:
         seeds = torch.stack(means) if means else torch.empty(0)
         return mean_and_error(seeds) if len(seeds) and not seeds.isnan().any() else None
 
-    def markdown(self) -> str:
-        """A table, one row per agent; a dash where there is nothing to measure."""
+    def interval(self, agent: str, metric: str) -> tuple[float, tuple[float, float] | None] | None:
+        """Interquartile mean over goals and seeds, and its 95% interval; ``None`` if it was not measured.
+
+        Goals for which the metric is not defined are left out.
+        """
+        found = [one[metric] for one in self.rows[agent].seeds if metric in one]
+        values = torch.stack(found) if found else torch.empty(0, 0)
+        values = values[:, ~values.isnan().any(0)]
+        return (float(interquartile_mean(values.flatten())), bootstrap_interval(values)) if values.numel() else None
+
+    def markdown(self, *, intervals: bool = False) -> str:
+        """A table, one row per agent; a dash where there is nothing to measure.
+
+        Args:
+            intervals: Also show the interquartile mean of the final score, with its interval.
+        """
         columns = [name for name in COLUMNS if any(self.summary(agent, name) for agent in self.rows)]
+        more = [f"{COLUMNS[SCORE][0]}, IQM [95%]"] * intervals
         lines = [
-            "| " + " | ".join(["agent", "seeds", *(COLUMNS[name][0] for name in columns)]) + " |",
-            "|" + "---|" * (2 + len(columns)),
+            "| " + " | ".join(["agent", "seeds", *more, *(COLUMNS[name][0] for name in columns)]) + " |",
+            "|" + "---|" * (2 + len(more) + len(columns)),
         ]
         for agent, row in self.rows.items():
-            cells = [_cell(self.summary(agent, name), COLUMNS[name][1]) for name in columns]
+            cells = [_interval_cell(self.interval(agent, SCORE), COLUMNS[SCORE][1])] * intervals
+            cells += [_cell(self.summary(agent, name), COLUMNS[name][1]) for name in columns]
             lines.append("| " + " | ".join([agent, str(len(row.seeds)), *cells]) + " |")
         at_start = int(score_is_undefined(self.goals).sum())
         if at_start:
@@ -235,3 +260,13 @@ def _cell(pair: tuple[float, float | None] | None, digits: int) -> str:
         digits += 1
         error = math.ceil(error * 10**digits) / 10**digits
     return f"{mean:.{digits}f} ± {error:.{digits}f}"
+
+
+def _interval_cell(found: tuple[float, tuple[float, float] | None] | None, digits: int) -> str:
+    """Interquartile mean and interval, if there is one; with a digit more, as it is narrow with many goals."""
+    if found is None:
+        return "–"
+    mean, ends = found
+    digits += 1
+    interval = "" if ends is None else f" [{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"
+    return f"{mean:.{digits}f}{interval}"

@@ -27,6 +27,8 @@ from torchrl_ocwm.parts import Part, load_plugins
 from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
 
 T = TypeVar("T")
+#: All groups of options that there are.
+GROUPS = {"agent", "explore", "size", "env"}
 _QUIET = ("job_logging", "hydra_logging")
 
 
@@ -57,7 +59,8 @@ def recipe(
                 store_options()
                 _check_choices(groups or {}, sys.argv[1:])
             ConfigStore.instance().store(name, _schema(kind, groups or {}, more))
-            hydra.main(version_base="1.3", config_path=None, config_name=name)(guarded)()
+            with _without(GROUPS - set(groups or {})):
+                hydra.main(version_base="1.3", config_path=None, config_name=name)(guarded)()
 
         return main
 
@@ -78,6 +81,17 @@ def store_options() -> None:
         store.store(name, node, group="explore", package=f"agent.behaviours.{EXPLORE}")
     for name, environment in ENVIRONMENTS.items():
         store.store(name, {"name": name, "options": defaults(environment.options)}, group="env")
+
+
+@contextmanager
+def _without(groups: Iterable[str]) -> Iterator[None]:
+    """Let a recipe that takes no such groups have plain settings of their names."""
+    repo = ConfigStore.instance().repo
+    aside = {group: repo.pop(group) for group in groups if group in repo}
+    try:
+        yield
+    finally:
+        repo.update(aside)
 
 
 def _check_choices(groups: Iterable[str], arguments: Iterable[str]) -> None:

@@ -28,7 +28,7 @@ class Training(Settings):
         log_interval: Updates between two lines of the log, over which losses are averaged.
         checkpoint_interval: Updates between two checkpoints.
         eval_interval: Updates between two evaluations; 0 for none.
-        eval_episodes: Episodes per evaluation, one to each of the task's first landmark goals.
+        eval_episodes: Episodes per evaluation, to as many of the task's landmark goals, drawn anew each time.
         eval_steps: Steps per episode.
         eval_beside: Evaluate a copy of the weights in a process of its own, while training goes on; ``None`` does so if
             the updates leave a core free. What is learnt does not depend on it.

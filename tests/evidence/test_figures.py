@@ -1,0 +1,126 @@
+"""Figures as data: the runs that each asks for are those that the recipes do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import pytest
+
+from torchrl_ocwm.agents import AGENTS, SIZES
+from torchrl_ocwm.envs import ENVIRONMENTS
+from torchrl_ocwm.evidence import BUDGETS, FIGURES, SETUPS, Evaluated, Evidence, Machine, Run, in_order, results
+from torchrl_ocwm.settings import SettingsError, change, from_dict, to_dict
+
+ROOT = Path("/runs/it's a=b")
+
+
+def runs(figure: str, **settings: Any) -> list[Run]:
+    return in_order(one.evaluated for one in results(Evidence(figure=figure, **{"seeds": 1, **settings})))
+
+
+def count(found: list[Run]) -> dict[str, int]:
+    kinds = [run.kind for run in found]
+    return {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)}
+
+
+def test_there_is_a_figure_for_each_name() -> None:
+    assert set(get_args(get_type_hints(Evidence)["figure"])) == set(FIGURES)
+    assert set(BUDGETS) == set(SIZES)
+    assert {"reacher", "cube_move", "shelf_place", "pick_place"} <= set(SETUPS)
+
+
+@pytest.mark.parametrize(
+    ("figure", "datasets", "trainings"),
+    [
+        ("table", 1, 7),
+        ("limits", 2, 8),
+        ("target_size", 6, 6),
+        ("loss_scale", 1, 4),
+        ("visual_goals", 1, 3),
+        ("curves", 1, 7),
+        ("exploration", 4, 4),
+    ],
+)
+@pytest.mark.parametrize("size", ["debug", "cpu", "paper"])
+def test_what_a_figure_needs(figure: str, datasets: int, trainings: int, size: str) -> None:
+    one = {"datasets": datasets, "trainings": trainings, "evaluations": trainings}
+    assert count(runs(figure, size=size)) == one
+    more = runs(figure, size=size, seeds=3, env=("reacher", "cube_move"))
+    trained = {"trainings": 6 * trainings, "evaluations": 6 * trainings}
+    assert count(more) == {"datasets": 2 * datasets, **trained}  # all seeds learn from the same data
+
+
+def test_what_is_needed_comes_first_and_a_whole_seed_before_the_next() -> None:
+    found = runs("table", seeds=2)
+    for place, run in enumerate(found):
+        assert all(one.name in [before.name for before in found[:place]] for one in run.needs)
+    seeds = [run.content["seed"] for run in found if isinstance(run, Evaluated)]
+    assert seeds == [0] * 7 + [1] * 7
+    kinds = [run.kind for run in found]
+    assert kinds == ["datasets", *["trainings", "evaluations"] * 14]  # an agent is evaluated before the next learns
+
+
+def test_figures_share_their_runs() -> None:
+    names = {figure: {run.name for run in runs(figure)} for figure in FIGURES}
+    assert names["curves"] == names["table"]
+    assert len(names["visual_goals"] - names["table"]) == 4  # LEXA's two agents, and their evaluations
+    assert len(names["loss_scale"] & names["table"]) == 3  # the data, and Dreamer with weights of 1
+    assert len(names["limits"] & names["table"]) == 9
+
+
+def test_commands_say_what_runs_are(compose: Callable[..., Any]) -> None:
+    """The settings that a recipe reads from the command of a run are those by which the run is found."""
+    every = {run.name: run for figure in FIGURES for run in runs(figure, size="debug")}
+    for run in every.values():
+        for script, *arguments in run.commands(ROOT, Machine(threads=3)):
+            config, content = compose(script.removesuffix(".py"), *arguments), run.content
+            assert not isinstance(config, str), config
+            if script == "evaluate.py":
+                assert config.checkpoint == str(ROOT / run.needs[0].name / "checkpoint.zip")
+                asked = ("goals", "episode_steps", "image_goals", "random", "seed")
+                assert {name: content[name] for name in asked} == {name: getattr(config, name) for name in asked}
+                continue
+            assert getattr(config, "seed", None) == content.get("seed") or config.training.seed == content["seed"]
+            if script == "train_offline.py":
+                assert (config.agent, config.size) == (content["agent"], content["size"])
+                assert config.training.deciding() == content["training"].deciding()
+                assert config.training.updates == content["training"].updates
+                assert config.training.threads == 3
+                assert config.training.eval_beside is False
+                assert config.dataset == str(ROOT / run.needs[0].name / "data")
+                continue
+            options = ENVIRONMENTS[config.env.name].options
+            assert from_dict(options, config.env.options) == content["options"]
+            if script == "train_online.py":
+                assert (config.agent, config.size) == (content["agent"], content["size"])
+                assert config.online == content["online"]
+
+
+def test_a_dataset_of_several_policies_is_collected_in_their_shares(compose: Callable[..., Any]) -> None:
+    [data] = [run for run in runs("table", env="cube_move", steps=101) if run.kind == "datasets"]
+    collected = [compose("collect", *arguments) for _, *arguments in data.commands(ROOT, Machine())]
+    assert [(one.policy, one.steps) for one in collected] == [("scripted", 76), ("random", 101)]
+
+
+def test_baselines_have_both_weights() -> None:
+    rows = {row.name: row for row in FIGURES["table"].rows}
+    for agent in ("dreamer", "focus"):
+        for weight in (1, 200):
+            changed = change(AGENTS[agent], rows[f"{agent}, weights {weight}"].changes).world_model
+            assert (changed.lambda_object_position, changed.lambda_goal_position) == (weight, weight)
+
+
+def test_what_is_not_known() -> None:
+    with pytest.raises(SettingsError, match="size must be one of debug, cpu, small, paper, large, got 'huge'"):
+        Evidence(figure="table", size="huge")
+    with pytest.raises(SettingsError, match="unknown environment 'nowhere'"):
+        Evidence(figure="table", env=("reacher", "nowhere"))
+    with pytest.raises(SettingsError, match="env must name an environment or several, got none"):
+        Evidence(figure="table", env=())
+
+
+def test_settings_of_a_run_fit_in_a_file() -> None:
+    for figure in FIGURES:
+        assert all(isinstance(to_dict(run.content), dict) for run in runs(figure))

@@ -1,0 +1,43 @@
+"""The paper's tables and figures from a command each: their runs as data, a queue that does what is missing, a page.
+
+Needs the extra ``recipes``.
+"""
+
+from torchrl_ocwm.evidence.estimate import Forecast, forecast, table
+from torchrl_ocwm.evidence.figures import BUDGETS, FIGURES, SETUPS, Budget, Figure, Result, Row, Setup, results
+from torchrl_ocwm.evidence.launchers import LAUNCHERS, Launcher
+from torchrl_ocwm.evidence.page import write_page
+from torchrl_ocwm.evidence.queue import RunFailedError, in_order, work_off
+from torchrl_ocwm.evidence.records import Record, RecordError
+from torchrl_ocwm.evidence.runs import Collected, Evaluated, Explored, Run, Trained
+from torchrl_ocwm.evidence.settings import Evidence, Machine
+
+__all__ = [
+    "BUDGETS",
+    "FIGURES",
+    "LAUNCHERS",
+    "SETUPS",
+    "Budget",
+    "Collected",
+    "Evaluated",
+    "Evidence",
+    "Explored",
+    "Figure",
+    "Forecast",
+    "Launcher",
+    "Machine",
+    "Record",
+    "RecordError",
+    "Result",
+    "Row",
+    "Run",
+    "RunFailedError",
+    "Setup",
+    "Trained",
+    "forecast",
+    "in_order",
+    "results",
+    "table",
+    "work_off",
+    "write_page",
+]

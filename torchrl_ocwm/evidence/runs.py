@@ -1,0 +1,473 @@
+"""What evidence is made of: datasets, trainings and evaluations, each found by the content of its settings."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, ClassVar
+
+from torchrl_ocwm.agents import AGENTS, SIZES
+from torchrl_ocwm.data import DatasetError, EpisodeDataset
+from torchrl_ocwm.envs import find_environment
+from torchrl_ocwm.evidence.settings import Machine
+from torchrl_ocwm.settings import Settings, change, from_dict
+from torchrl_ocwm.training import CHECKPOINT, Online, Training
+
+#: A script of ``examples/`` and its arguments.
+Command = tuple[str, ...]
+#: Episodes of each evaluation during training, to as many of the landmark goals.
+LANDMARKS = 5
+#: Evaluations during training.
+EVALUATIONS = 10
+#: Seeds an explorer's dataset, and how much it learns while it explores.
+SEED_STEPS, UPDATE_RATIO = 0.1, 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run(ABC):
+    """Something to be done once: its folder is named by the content of its settings.
+
+    Commands that have been stopped, or that were run before, go on where they were when they are run again.
+    """
+
+    kind: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def prefix(self) -> str:
+        """What people call it by."""
+
+    @property
+    @abstractmethod
+    def content(self) -> dict[str, Any]:
+        """The settings that decide what it finds."""
+
+    @property
+    @abstractmethod
+    def work(self) -> int:
+        """How much there is to do: steps or updates."""
+
+    @property
+    @abstractmethod
+    def pace(self) -> str:
+        """What it is as fast as, of other runs."""
+
+    @property
+    def needs(self) -> tuple[Run, ...]:
+        """What has to be there before."""
+        return ()
+
+    @abstractmethod
+    def commands(self, root: Path, machine: Machine) -> list[Command]:
+        """What does it, one after the other."""
+
+    @abstractmethod
+    def reached(self, root: Path) -> int:
+        """How much of the work is done, as far as its files say."""
+
+    @cached_property
+    def name(self) -> str:
+        """Its folder in that of all runs; runs of the same name are the same."""
+        text = json.dumps(essential(self.content), sort_keys=True)
+        return f"{self.kind}/{self.prefix}-{sha256(text.encode()).hexdigest()[:8]}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collected(Run):
+    """A dataset of policies that do not learn.
+
+    Args:
+        env: Where it is from.
+        options: Of the environment, beside its defaults.
+        policies: Who collects, one after the other, and how many steps.
+        seed: Seeds episodes.
+    """
+
+    kind = "datasets"
+
+    env: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    policies: Mapping[str, int]
+    seed: int = 0
+
+    @property
+    def prefix(self) -> str:
+        """Environment and policies."""
+        return "-".join([self.env, *self.policies])
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """All of it."""
+        return {
+            "env": self.env,
+            "options": all_options(self.env, self.options),
+            "policies": list(self.policies.items()),
+            "seed": self.seed,
+        }
+
+    @property
+    def work(self) -> int:
+        """Steps."""
+        return sum(self.policies.values())
+
+    @property
+    def pace(self) -> str:
+        """Simulator and image."""
+        return f"collect {self.env} {image_size(self.env, self.options)}"
+
+    def commands(self, root: Path, machine: Machine) -> list[Command]:  # noqa: ARG002
+        """``collect.py``, once for each policy."""
+        shared = [f"env={self.env}", *given("env.options", self.options), f"seed={self.seed}", "workers=0"]
+        path, done, commands = override("dataset", self.dataset(root)), 0, []
+        for policy, steps in self.policies.items():
+            done += steps
+            commands.append(("collect.py", *shared, f"policy={policy}", f"steps={done}", path))
+        return commands
+
+    def dataset(self, root: Path) -> Path:
+        """Where the dataset is."""
+        return root / self.name / "data"
+
+    def reached(self, root: Path) -> int:
+        """Steps collected."""
+        return steps_in(self.dataset(root))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explored(Run):
+    """A dataset of an explorer, which learns from what it has collected.
+
+    Args:
+        env: Where it is from.
+        options: Of the environment, beside its defaults.
+        explorer: A row that explores.
+        size: Its size.
+        steps: Environment steps.
+        seed: Seeds all of it.
+    """
+
+    kind = "datasets"
+
+    env: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    explorer: str
+    size: str
+    steps: int
+    seed: int = 0
+
+    @property
+    def prefix(self) -> str:
+        """Environment and explorer."""
+        return f"{self.env}-{self.explorer}"
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """All of it."""
+        return {
+            "env": self.env,
+            "options": all_options(self.env, self.options),
+            "agent": AGENTS[self.explorer],
+            "size": SIZES[self.size],
+            "online": self._online,
+            "seed": self.seed,
+        }
+
+    @property
+    def work(self) -> int:
+        """Steps."""
+        return self.steps
+
+    @property
+    def pace(self) -> str:
+        """Simulator, explorer and its size."""
+        return f"explore {self.env} {image_size(self.env, self.options)} {self.explorer} {self.size}"
+
+    @property
+    def updates(self) -> int:
+        """Updates while it explores."""
+        return max(1, round(UPDATE_RATIO * self.steps))
+
+    @property
+    def _online(self) -> Online:
+        seeded = max(1, round(SEED_STEPS * self.steps))
+        first = max(1, round(SEED_STEPS * self.updates))
+        return Online(steps=self.steps, seed_steps=(seeded,), seed_updates=first, update_ratio=UPDATE_RATIO, workers=0)
+
+    def commands(self, root: Path, machine: Machine) -> list[Command]:
+        """``train_online.py``."""
+        online = self._online
+        settings = {
+            "steps": online.steps,
+            "seed_steps": list(online.seed_steps),
+            "seed_updates": online.seed_updates,
+            "update_ratio": online.update_ratio,
+            "workers": online.workers,
+        }
+        training = {"seed": self.seed, "updates": self.updates, "eval_interval": 0, "video_interval": 0}
+        return [
+            (
+                "train_online.py",
+                *(f"agent={self.explorer}", f"env={self.env}", f"size={self.size}"),
+                *given("env.options", self.options),
+                *given("online", settings),
+                *given("training", {**training, "threads": machine.threads, "device": machine.device}),
+                override("output", root / self.name),
+                override("dataset", self.dataset(root)),
+            )
+        ]
+
+    def dataset(self, root: Path) -> Path:
+        """Where the dataset is."""
+        return root / self.name / "data"
+
+    def reached(self, root: Path) -> int:
+        """Steps collected."""
+        return steps_in(self.dataset(root))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trained(Run):
+    """An agent that has learnt from a dataset.
+
+    Args:
+        data: The dataset.
+        agent: A row.
+        changes: Settings of the row that are otherwise, by dotted names.
+        size: Its size.
+        seed: Seeds weights and sampling.
+        updates: Updates.
+        episode_steps: Steps of the episodes that are played meanwhile. They decide nothing.
+    """
+
+    kind = "trainings"
+
+    data: Collected | Explored
+    agent: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    size: str
+    seed: int
+    updates: int
+    episode_steps: int = 100
+
+    @property
+    def prefix(self) -> str:
+        """Environment, row and seed."""
+        return f"{self.data.env}-{self.agent}-s{self.seed}"
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """Agent, size, dataset, and what decides a training."""
+        return {
+            "agent": change(AGENTS[self.agent], self.changes),
+            "size": SIZES[self.size],
+            "training": Training(seed=self.seed, updates=self.updates),
+            "data": self.data.content,
+        }
+
+    @property
+    def work(self) -> int:
+        """Updates."""
+        return self.updates
+
+    @property
+    def steps_played(self) -> int:
+        """Steps of the episodes that are played meanwhile."""
+        return self.updates // self._eval_interval * LANDMARKS * self.episode_steps
+
+    @property
+    def _eval_interval(self) -> int:
+        return -(-self.updates // EVALUATIONS)
+
+    @property
+    def pace(self) -> str:
+        """Row, size and image."""
+        return f"train {self.agent} {self.size} {image_size(self.data.env, self.data.options)}"
+
+    @property
+    def needs(self) -> tuple[Run, ...]:
+        """The dataset."""
+        return (self.data,)
+
+    def commands(self, root: Path, machine: Machine) -> list[Command]:
+        """``train_offline.py``."""
+        evaluation = {
+            "eval_interval": self._eval_interval,
+            "eval_episodes": LANDMARKS,
+            "eval_steps": self.episode_steps,
+            "eval_beside": False,  # other runs have the other cores
+        }
+        learning = {"seed": self.seed, "updates": self.updates, "video_interval": 0}
+        settings = {**learning, **evaluation, "threads": machine.threads, "device": machine.device}
+        return [
+            (
+                "train_offline.py",
+                *(f"agent={self.agent}", f"env={self.data.env}", f"size={self.size}"),
+                *given("agent", self.changes),
+                *given("training", settings),
+                override("dataset", self.data.dataset(root)),
+                override("output", root / self.name),
+            )
+        ]
+
+    def reached(self, root: Path) -> int:
+        """Updates that are logged."""
+        return last_step(root / self.name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluated(Run):
+    """The scores of an agent on a grid of goals.
+
+    Args:
+        trained: The agent. Its seed is that of the episodes too.
+        goals: Goals, a square grid.
+        episode_steps: Steps of each episode.
+        image_goals: Whether goals are given as images too.
+        random: Whether random actions are evaluated too.
+    """
+
+    kind = "evaluations"
+
+    trained: Trained
+    goals: int
+    episode_steps: int
+    image_goals: bool = False
+    random: bool = False
+
+    @property
+    def prefix(self) -> str:
+        """That of the training."""
+        return self.trained.prefix
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """The agent, and what is asked of it."""
+        return {"trained": self.trained.content, **self._settings}
+
+    @property
+    def _settings(self) -> dict[str, Any]:
+        return {
+            "goals": self.goals,
+            "episode_steps": self.episode_steps,
+            "image_goals": self.image_goals,
+            "random": self.random,
+            "seed": self.trained.seed,
+        }
+
+    @property
+    def work(self) -> int:
+        """Steps of all episodes."""
+        return self.goals * self.episode_steps * (1 + self.image_goals + self.random)
+
+    @property
+    def pace(self) -> str:
+        """Simulator, row, size and image."""
+        data = self.trained.data
+        return f"evaluate {data.env} {image_size(data.env, data.options)} {self.trained.agent} {self.trained.size}"
+
+    @property
+    def needs(self) -> tuple[Run, ...]:
+        """The agent."""
+        return (self.trained,)
+
+    def commands(self, root: Path, machine: Machine) -> list[Command]:  # noqa: ARG002
+        """``evaluate.py``."""
+        settings = [f"{name}={written(value)}" for name, value in self._settings.items()]
+        checkpoint = override("checkpoint", root / self.trained.name / CHECKPOINT)
+        output = override("output", root / self.name)
+        return [("evaluate.py", checkpoint, output, *settings, "workers=0", "envs=10", "video_goals=0")]
+
+    def reached(self, root: Path) -> int:
+        """All or nothing: an evaluation begins anew."""
+        return self.work if (root / self.name / "results.json").exists() else 0
+
+
+def essential(content: Any) -> Any:
+    """Settings without those that have their default.
+
+    So a setting that is added later, with what was the rule before as its default, changes no name.
+
+    Examples:
+        >>> essential({"training": Training(seed=3), "env": "reacher"})
+        {'training': {'seed': 3}, 'env': 'reacher'}
+    """
+    if isinstance(content, Mapping):
+        return {name: essential(value) for name, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [essential(value) for value in content]
+    if not is_dataclass(content):
+        return content
+    known = content.name_and_kind() if isinstance(content, Settings) else None
+    name: dict[str, Any] = {} if known is None else {"name": known[0]}
+    values = {one.name: getattr(content, one.name) for one in fields(content) if not _is_default(content, one)}
+    return {**name, **{name: essential(value) for name, value in values.items()}}
+
+
+def _is_default(settings: Any, one: Any) -> bool:
+    default = one.default if one.default_factory is MISSING else one.default_factory()
+    return bool(getattr(settings, one.name) == default)
+
+
+def all_options(env: str, options: Mapping[str, Any]) -> Any:
+    """The options of an environment as its settings class, which has the defaults of the others."""
+    return from_dict(find_environment(env).options, options, "options")
+
+
+def image_size(env: str, options: Mapping[str, Any]) -> int:
+    """Pixels on a side; an environment of a plugin may have another name for it, and then it is 0."""
+    return getattr(all_options(env, options), "image_size", 0)
+
+
+def given(at: str, values: Mapping[str, Any]) -> list[str]:
+    """Settings below a name, as a command line has them.
+
+    Examples:
+        >>> given("agent.world_model", {"lambda_proprio": 2.0, "observed": ["proprio"]})
+        ['agent.world_model.lambda_proprio=2.0', 'agent.world_model.observed=[proprio]']
+    """
+    return [f"{at}.{name}={written(value)}" for name, value in values.items()]
+
+
+def written(value: Any) -> str:
+    """A value as a command line has it.
+
+    Examples:
+        >>> written(True), written(None), written(("a", 1))
+        ('true', 'null', '[a,1]')
+    """
+    if isinstance(value, (list, tuple)):
+        return f"[{','.join(map(written, value))}]"
+    return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))
+
+
+def override(name: str, path: Path) -> str:
+    r"""A path as a command line has it, whatever letters are in it.
+
+    Examples:
+        >>> print(override("output", Path("what's/a=b")))
+        output='what\'s/a=b'
+    """
+    text = str(path).replace("'", "\\'")
+    return f"{name}='{text}'"
+
+
+def steps_in(path: Path) -> int:
+    """Environment steps of a dataset, if there is one."""
+    try:
+        with EpisodeDataset.open(path) as dataset:
+            return dataset.num_steps
+    except DatasetError:
+        return 0
+
+
+def last_step(folder: Path) -> int:
+    """The last update that a training has logged."""
+    from torchrl_ocwm.evaluation.plots import read_scalar
+
+    curve = read_scalar(folder, "loss_value") if (folder / CHECKPOINT).exists() else None
+    return 0 if curve is None else int(curve[0][-1])
