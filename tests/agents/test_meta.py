@@ -75,6 +75,7 @@ def test_imagination(agent: Agent) -> None:
 
 
 def test_what_the_sampler_does_to_a_batch() -> None:
+    batch = records()
     with torch.device("meta"):
-        batch = RelabelGoals(TASK.workspace)(records())
+        batch = RelabelGoals(TASK.workspace)(batch)
     assert devices(batch.values(True, True)) == {"meta"}
