@@ -6,6 +6,7 @@ import json
 import re
 from typing import Any
 
+import pytest
 from reading import RESULTS, missing, unchecked
 
 NAME = "exploration"
@@ -16,36 +17,42 @@ SHOWN = {
     "focus_explore": "FOCUS",
 }
 #: What was done: no file beside the page has these numbers.
-STATED = ["At commit 45c8d50", "PyTorch 2.13.0 on the CPU"]
+STATED = ["Reacher at commit 45c8d50 and Cube move at commit e41df8a", "PyTorch 2.13.0 on the CPU", "in 1,000 random steps"]
+ENVIRONMENTS = {"reacher": "REACHER", "cube_move": "CUBE"}
 
 
-def last() -> dict[str, Any]:
+def last(env: str) -> dict[str, Any]:
     """The last point of each curve, and the steps there."""
-    curves = json.loads((RESULTS / NAME / "reacher" / "results.json").read_text())
+    curves = json.loads((RESULTS / NAME / env / "results.json").read_text())
     return {name: {**curve[max(curve, key=int)], "steps": max(map(int, curve))} for name, curve in curves.items()}
 
 
-def measured() -> list[str]:
-    points = last()
+def measured(env: str, digits: dict[str, int]) -> list[str]:
+    points = last(env)
     script = (RESULTS / NAME / "run.sh").read_text()
     ratio = float(re.findall(r"RATIO:-([\d.]+)", script)[0])
-    steps, seed_steps = (int(one) for one in re.findall(r"REACHER_STEPS:-(\d+)}\" 100 (\d+)", script)[0])
+    steps, seed_steps = (int(one) for one in re.findall(rf"{ENVIRONMENTS[env]}_STEPS:-(\d+)}}\" 100 (\d+)", script)[0])
     updates = round(100 + ratio * (steps - seed_steps))
     return [
         f"{steps:,} steps each; the explorers' first {seed_steps:,} are random",
         f"{updates:,} updates",
-        *(f"{shown}: {points[name]['visited']:.0%} and {points[name]['moves']:.0%}" for name, shown in SHOWN.items()),
+        *(
+            f"{shown}: {points[name]['visited']:.0%} and {points[name]['moves']:.{digits.get(name, 0)}%}"
+            for name, shown in SHOWN.items()
+        ),
     ]
 
 
-def test_table() -> None:
-    table = (RESULTS / NAME / "reacher" / "results.md").read_text().strip()
+@pytest.mark.parametrize("env", ENVIRONMENTS)
+def test_table(env: str) -> None:
+    table = (RESULTS / NAME / env / "results.md").read_text().strip()
     assert table in (RESULTS / NAME / "README.md").read_text()
-    for name, point in last().items():
+    for name, point in last(env).items():
         assert f"| {name} | {point['steps']:,} | {point['visited']:.0%} | {point['moves']:.0%} |" in table
 
 
 def test_page() -> None:
-    sentences = [*measured(), *STATED]
+    rare = {"random": 1, "scripted": 1, "plan2explore": 2, "focus_explore": 2}
+    sentences = [*measured("reacher", {}), *measured("cube_move", rare), *STATED]
     assert missing(NAME, sentences) == []
     assert unchecked(NAME, sentences) == []

@@ -10,7 +10,7 @@ from reading import RESULTS, mean, missing, report, settings, unchecked
 NAME = "reacher/visual_goals"
 AGENTS = {"focus_lcp": "FOCUS + LCP", "lexa_cosine": "LEXA cosine", "lexa_temporal": "LEXA temporal"}
 #: What was done: no file beside the page has these numbers.
-STATED = ["At commit 45c8d50", "PyTorch 2.13.0 on the CPU", "within 5 cm of all of them"]
+STATED = ["At commit 45c8d50, and seed 1 and the evaluation at commit e41df8a", "PyTorch 2.13.0 on the CPU"]
 
 
 def protocol() -> list[str]:
@@ -19,6 +19,7 @@ def protocol() -> list[str]:
     runs = [settings(NAME, file.stem)["training"] for file in (RESULTS / NAME).glob("*_seed_*.yaml")]
     (updates,) = {run["updates"] for run in runs}
     (steps,) = re.findall(r"steps=(\d+)", (RESULTS / NAME / "run.sh").read_text())
+    assert {run["seed"] for run in runs} == {0, 1}
     side, each = math.isqrt(len(numbers.goals)), numbers.settings["episode_steps"]
     return [
         f"the same {int(steps):,} steps of data, {updates:,} updates",
@@ -35,12 +36,12 @@ def measured() -> list[str]:
         f"{mean(numbers, images[agent], 'final_distance', 100):.1f} cm from its goals"
         for agent, shown in AGENTS.items()
     ]
-    assert mean(numbers, images["focus_lcp"], "success") == 1
     lost = mean(numbers, "focus_lcp", "final_score") - mean(numbers, images["focus_lcp"], "final_score")
     imagined = mean(numbers, images["lexa_temporal"], "imagined_distance", 100)
     return [
         *sentences,
         f"would add is {lost:.2f}",
+        f"within 5 cm of {mean(numbers, images['focus_lcp'], 'success'):.0%} of them",
         f"within 5 cm of {mean(numbers, images['lexa_cosine'], 'success'):.0%} of its goals",
         f"random actions ({mean(numbers, 'random', 'final_score'):.2f})",
         f"expects to end {imagined:.1f} cm off",
