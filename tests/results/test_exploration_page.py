@@ -17,7 +17,11 @@ SHOWN = {
     "focus_explore": "FOCUS",
 }
 #: What was done: no file beside the page has these numbers.
-STATED = ["Reacher at commit 45c8d50 and Cube move at commit e41df8a", "PyTorch 2.13.0 on the CPU", "in 1,000 random steps"]
+STATED = [
+    "Reacher at commit 45c8d50 and Cube move at commit e41df8a",
+    "PyTorch 2.13.0 on the CPU",
+    "in 1,000 random steps",
+]
 ENVIRONMENTS = {"reacher": "REACHER", "cube_move": "CUBE"}
 
 
