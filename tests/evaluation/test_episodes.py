@@ -178,8 +178,8 @@ def test_process_that_dies_or_hangs_ends_the_evaluation(task: Task, number: sign
         os.kill(child.pid, number)  # type: ignore[arg-type]
         return push(tensordict)
 
-    message = "has ended .signal SIGKILL" if number == signal.SIGKILL else "no sign of life for 3 seconds"
-    with EvaluationEnvs(task, episode_steps=5, workers=1, envs=1, timeout=3) as envs:
+    message = "has ended .signal SIGKILL" if number == signal.SIGKILL else "no sign of life for 15 seconds"
+    with EvaluationEnvs(task, episode_steps=5, workers=1, envs=1, timeout=15) as envs:
         envs.run(push, goals(task, 1))
         with pytest.raises(WorkerError, match=message):
             envs.run(act, goals(task, 1))
