@@ -63,7 +63,7 @@ def run(dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             seen.batches.append(arguments[0].clone())
             seen.threads.append(torch.get_num_threads())
 
-        agent.loss.register_forward_pre_hook(look)
+        agent.loss.model_loss.register_forward_pre_hook(look)
         save, log, schedule = Archive.save, CSVLogger.log_scalar, runs.make_schedule
 
         def note_save(self: Archive, *arguments: Any, **options: Any) -> Path:
@@ -77,7 +77,7 @@ def run(dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
         def note_rates(optimizer: torch.optim.Optimizer, training: Training) -> Any:
             made = schedule(optimizer, training)
-            agent.loss.register_forward_hook(lambda *_: seen.rates.append(made.get_last_lr()[0]) and None)
+            agent.loss.model_loss.register_forward_hook(lambda *_: seen.rates.append(made.get_last_lr()[0]) and None)
             return made
 
         def film(updates: int) -> Path:
@@ -191,7 +191,9 @@ def test_mixed_precision(run: Callable[..., Run], monkeypatch: pytest.MonkeyPatc
     forward = Stepper._forward_backward
 
     def look(self: Stepper, sample: TensorDictBase) -> TensorDictBase:
-        handle = self.loss_module.register_forward_pre_hook(lambda *_: seen.add(torch.is_autocast_enabled("cpu")))
+        handle = self.loss_module.model_loss.register_forward_pre_hook(
+            lambda *_: seen.add(torch.is_autocast_enabled("cpu"))
+        )
         try:
             return forward(self, sample)
         finally:
