@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import Tensor
 
 from torchrl_ocwm.agents import AGENTS, Agent, Behaviour, build_agent
 from torchrl_ocwm.data import Collection, EpisodeDataset, collect
@@ -138,8 +139,18 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EpisodeDataset
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_agents_for_either_of_two_cubes(index: int, dataset: EpisodeDataset, tmp_path: Path) -> None:
+def test_agents_for_either_of_two_cubes(
+    index: int, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Rewards that are learnt, scores during training and afterwards: all about the cube of the behaviour."""
+    played: list[tuple[Tensor, Tensor]] = []
+    run = EvaluationEnvs.run
+
+    def note(self: EvaluationEnvs, policy: Any, goals: Tensor, *, numbers: Tensor, **settings: Any) -> Any:
+        played.append((goals, numbers))
+        return run(self, policy, goals, numbers=numbers, **settings)
+
+    monkeypatch.setattr(EvaluationEnvs, "run", note)
     task = dataset.task
     agent = about(OBJECTS[index], "dreamer", task)
     training = Training(updates=2, eval_interval=2, log_interval=1, video_interval=0, checkpoint_interval=2)
@@ -147,9 +158,9 @@ def test_agents_for_either_of_two_cubes(index: int, dataset: EpisodeDataset, tmp
     with LandmarkEvaluation(agent, episodes=1, episode_steps=2) as evaluation:
         keep = lambda updates: scores.append(evaluation(updates)) or scores[-1]  # noqa: E731
         train_offline(agent, dataset, tmp_path, training, evaluate=keep, progress=False)
-    goals = torch.tensor(task.workspace.landmarks[:1])
+    goals, numbers = played[-1]  # of the landmark that was drawn
     with EvaluationEnvs(task, episode_steps=2, workers=0, envs=1) as envs:
-        episodes = envs.run(agent.eval().policy(), goals)
+        episodes = envs.run(agent.eval().policy(), goals, numbers=numbers)
     true = episodes["object_position_true"]
     assert (true[:, 0, 0] - true[:, 0, 1]).norm(dim=-1).min() > 0.02  # the cubes are at different places
     expected = [float(normalized_score(true[:, -1, one], goals).mean()) for one in (0, 1)]
