@@ -74,7 +74,9 @@ def make_agent() -> Callable[..., Agent]:
 @pytest.fixture
 def no_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Random numbers that are all the same, for code that draws them in another order."""
-    rand = torch.rand
+    with torch.device("cpu"):  # PyTorch notes once, at the first of these, which functions make tensors
+        rand = torch.rand
+        rand(1)
 
     def constant(*size: Any, **kwargs: Any) -> torch.Tensor:
         if "generator" in kwargs:  # test data

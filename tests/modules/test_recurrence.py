@@ -84,6 +84,21 @@ def test_rollout_is_that_of_torchrl(style: str) -> None:
     torch.testing.assert_close(of_own, of_input, rtol=1e-4, atol=1e-5)
 
 
+def test_a_step_that_torchrl_has_chosen_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``compile_rollout`` keeps its effect."""
+    prior, posterior = (ours for _, ours in pairs("dreamer_v3"))
+    steps, step = [], Rollout._step
+    monkeypatch.setattr(Rollout, "_step", lambda self, *inputs: steps.append(1) or step(self, *inputs))
+    own = rollout(Rollout, prior, posterior)
+    torch.manual_seed(3)
+    expected = own(sequences())
+    assert not steps
+    own.compile_rollout("step", compile=False)
+    torch.manual_seed(3)
+    torch.testing.assert_close(own(sequences())["next"], expected["next"], rtol=1e-4, atol=1e-5)
+    assert len(steps) == 6
+
+
 @pytest.mark.parametrize("batch", [(7,), (2, 3)])
 def test_block_gru_is_that_of_torchrl(batch: tuple[int, ...]) -> None:
     (prior, ours), _ = pairs("dreamer_v3")

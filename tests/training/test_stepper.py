@@ -9,7 +9,7 @@ from filelock import FileLock, Timeout
 from tensordict import TensorDict, TensorDictBase
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 
-from torchrl_ocwm.agents import build_agent
+from torchrl_ocwm.agents import EXPLORERS, build_agent
 from torchrl_ocwm.testing import random_records, reacher_task
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_schedule, make_stepper, one_graph
@@ -99,3 +99,13 @@ def test_two_processes_do_not_compile_at_the_same_time(
     monkeypatch.setattr(DreamerV3OptimizationStepper, "warmup", warmup)
     stepper.warmup(records)
     assert held == (["held"] if compiles else [])
+
+
+def test_the_world_model_is_differentiated_before_behaviours_imagine(make_agent: Any, records: TensorDict) -> None:
+    """So that one graph at a time is in memory."""
+    agent, before = make_agent("focus_pcp", {"behaviours.explore": EXPLORERS["plan2explore"]}), []
+    weight = next(agent.model.encoder.parameters())
+    for behaviour in agent.loss.behaviours.values():
+        behaviour.register_forward_pre_hook(lambda *_: before.append(weight.grad is not None))
+    make_stepper(agent, Training()).step(None, records)
+    assert before == [True, True]

@@ -187,6 +187,8 @@ class Rollout(RSSMRolloutV3):
     def _loop(
         self, state: Tensor, belief: Tensor, action: Tensor, embedding: Tensor, reset: Tensor
     ) -> tuple[Tensor, ...]:
+        if self._step_fn is not None:  # compile_rollout("step")
+            return super()._loop(state, belief, action, embedding, reset)
         prior, posterior = self.rssm_prior.module, self.rssm_posterior.module
         # Two draws for each step, as TorchRL does it, so that random numbers are those of its compiled rollouts.
         shape = (action.shape[-2], 2, *action.shape[:-2], prior.num_categoricals, 1)

@@ -20,7 +20,7 @@ PositionalGradient = Literal["encoder", "latent", "both"]
 
 
 def instance_masks(masks: Tensor) -> Tensor:
-    """Masks of objects and background that share the pixels out: each belongs to its first object, or to none of them.
+    """Masks of objects and background that share the pixels out: each is of its first object, or of the background.
 
     Args:
         masks: ``[..., O, H, W]`` bool, or integers that are 0 outside.
