@@ -4,6 +4,7 @@ import ast
 import importlib.metadata
 import importlib.util
 import os
+import pkgutil
 import re
 import subprocess
 import sys
@@ -121,6 +122,19 @@ def test_users_are_shown_imports_from_rooms_not_from_their_modules(file: Path) -
         if not inside or inside[0] in ROOMS:
             exported = import_module(module).__all__
             assert set(names) <= set(exported), f"{module} does not export {sorted(set(names) - set(exported))}"
+
+
+def test_no_class_has_the_name_of_another_one_of_torchrl() -> None:
+    peers = ("collectors", "data", "envs", "modules", "objectives", "record", "trainers")
+    theirs = {name for peer in peers for name in dir(import_module(f"torchrl.{peer}"))}
+    ours = {
+        name: one.__module__
+        for module in pkgutil.walk_packages(torchrl_ocwm.__path__, "torchrl_ocwm.")
+        if module.name != FOR_ITS_EFFECT
+        for name, one in vars(import_module(module.name)).items()
+        if isinstance(one, type) and one.__module__.startswith("torchrl_ocwm.")
+    }
+    assert {name: ours[name] for name in theirs & set(ours)} == {}
 
 
 @pytest.mark.parametrize("room", ROOMS)

@@ -45,8 +45,8 @@ from tqdm import trange
 from torchrl_ocwm.data import EpisodeDataset, RelabelGoals, make_replay_buffer
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.modules import (
-    Actor,
     Architecture,
+    BoundedNormalActor,
     InitialLatent,
     ObjectDecoder,
     ObjectLatentExtractor,
@@ -128,7 +128,7 @@ def make_dreamer(task: Task, width: int) -> Dreamer:
     imagined_reward = TensorDictSequential(Mod(reward, LATENT, ["logits"]), Mod(two_hot, ["logits"], ["reward"]))
     model = WorldModelWrapper(Mod(prior, [*LATENT, "action"], ["_", *LATENT]), imagined_reward)
     actor = ProbabilisticTensorDictSequential(
-        Mod(Actor(state + belief, action, layers=2, units=width), LATENT, ["loc", "scale"]),
+        Mod(BoundedNormalActor(state + belief, action, layers=2, units=width), LATENT, ["loc", "scale"]),
         ProbabilisticTensorDictModule(["loc", "scale"], ["action"], distribution_class=IndependentNormal),
     )
     critic = TensorDictSequential(

@@ -23,7 +23,7 @@ from torchrl_ocwm.modules import UnitRMS
 from torchrl_ocwm.settings import SettingsError, change
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
 from torchrl_ocwm.training.offline import train_offline
-from torchrl_ocwm.training.run import Sampler
+from torchrl_ocwm.training.run import TrainingBatches
 from torchrl_ocwm.training.settings import Training
 
 OBJECTS = ("cube", "distractor")
@@ -92,7 +92,7 @@ def test_goals_of_frames_in_which_it_is_seen(row: str, entry: str) -> None:
 def test_training_records(row: str, index: int, tmp_path: Path) -> None:
     agent = about(OBJECTS[index], row)
     with random_dataset(tmp_path / "data", TASK) as dataset:
-        batch = Sampler(agent, dataset, Training())._replay.sample()["next"]
+        batch = TrainingBatches(agent, dataset, Training())._replay.sample()["next"]
     away = (batch["object_position"][..., index, :] - batch["goal_position"]).norm(dim=-1, keepdim=True)
     torch.testing.assert_close(batch["reward"], -away)
 

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from torchrl_ocwm.agents import Architecture
 from torchrl_ocwm.modules import (
-    Actor,
+    BoundedNormalActor,
     InitialLatent,
     ObservationEncoder,
     PositionDistanceReward,
@@ -77,7 +77,7 @@ def test_uniform_goals_fill_the_workspace() -> None:
 
 
 def test_actor_stays_in_its_bounds() -> None:
-    actor = Actor(3, 2, layers=1, units=8)
+    actor = BoundedNormalActor(3, 2, layers=1, units=8)
     with torch.no_grad():
         for parameter in actor.parameters():
             parameter.mul_(100)
@@ -88,7 +88,7 @@ def test_actor_stays_in_its_bounds() -> None:
 
 
 def test_a_fresh_actor_is_centred_and_wide() -> None:
-    mean, std = Actor(3, 2, layers=1, units=64)(torch.randn(100, 3))
+    mean, std = BoundedNormalActor(3, 2, layers=1, units=64)(torch.randn(100, 3))
     assert mean.abs().max() < 0.1
     torch.testing.assert_close(std, torch.full_like(std, 0.1 + 0.9 / (1 + math.exp(-2))), rtol=0.02, atol=0)
 

@@ -19,7 +19,7 @@ from torchrl.objectives import DreamerV3ActorLoss, DreamerV3Loss, DreamerV3Value
 
 from torchrl_ocwm.agents import Agent
 from torchrl_ocwm.modules import UniformGoals
-from torchrl_ocwm.objectives import BehaviourLoss, GoalConditionedDreamerLoss, WorldModelLoss
+from torchrl_ocwm.objectives import BehaviourLoss, GoalConditionedDreamerLoss, WeightedModelLoss
 
 
 def network(module: Any, index: int = 0) -> nn.Module:
@@ -63,7 +63,7 @@ def torchrl_loss(agent: Agent, replay_weight: float) -> DreamerV3Loss:
     actor_loss.make_value_estimator(ValueEstimators.TDLambda, gamma=0.99, lmbda=0.95)
     value_loss = DreamerV3ValueLoss(value, value_loss="two_hot", actor_loss=actor_loss, slow_critic_regularization=1.0)
     return DreamerV3Loss(
-        WorldModelLoss(model.records()), actor_loss, value_loss, replay_value_loss_weight=replay_weight
+        WeightedModelLoss(model.records()), actor_loss, value_loss, replay_value_loss_weight=replay_weight
     )
 
 

@@ -10,7 +10,7 @@ from torch import nn
 from torchrl.objectives import DreamerV3ModelLoss, symlog
 
 from torchrl_ocwm.agents import AGENTS, SIZES, build_agent
-from torchrl_ocwm.objectives import WorldModelLoss
+from torchrl_ocwm.objectives import WeightedModelLoss
 from torchrl_ocwm.objectives.world_model import image_reconstruction, symlog_reconstruction
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import STYLES, reacher_task
@@ -34,7 +34,7 @@ def torchrl_loss(world_model: TensorDictModule) -> DreamerV3ModelLoss:
 def test_sums_to_torchrls_loss(make_agent: Any, records: TensorDict) -> None:
     world_model = make_agent("dreamer").model.records()
     torch.manual_seed(1)
-    ours, _ = WorldModelLoss(world_model)(records)
+    ours, _ = WeightedModelLoss(world_model)(records)
     torch.manual_seed(1)
     theirs, _ = torchrl_loss(world_model)(records)
     parts = ("pixels", "proprio", "object_position", "goal_position")
@@ -48,7 +48,7 @@ def test_each_weight_scales_its_own_loss(make_agent: Any, records: TensorDict) -
 
     def losses(**weights: float) -> TensorDict:
         torch.manual_seed(1)
-        return WorldModelLoss(world_model, **weights)(records)[0]
+        return WeightedModelLoss(world_model, **weights)(records)[0]
 
     plain = losses()
     for name in plain.keys():
@@ -66,7 +66,7 @@ def test_each_weight_scales_its_own_loss(make_agent: Any, records: TensorDict) -
 def test_gradients(make_agent: Any, records: TensorDict, part: str) -> None:
     """Each loss alone reaches its own head and the RSSM, and no other head."""
     agent = make_agent("dreamer")
-    losses, _ = WorldModelLoss(agent.model.records(), free_nats=0.0)(records)
+    losses, _ = WeightedModelLoss(agent.model.records(), free_nats=0.0)(records)
     losses[f"loss_model_{part}"].backward()
     reached = {
         name.split(".")[0] if not name.startswith("vector_decoders") else name.split(".")[1]
@@ -84,7 +84,7 @@ def test_gradients(make_agent: Any, records: TensorDict, part: str) -> None:
 
 
 def test_a_missing_prediction_is_left_out(make_agent: Any, records: TensorDict) -> None:
-    losses, _ = WorldModelLoss(make_agent("dreamer_pcp").model.records())(records)
+    losses, _ = WeightedModelLoss(make_agent("dreamer_pcp").model.records())(records)
     assert not {"loss_model_goal_position", "loss_model_reward"} & set(losses.keys())
 
 
@@ -96,20 +96,20 @@ def test_free_nats_act_on_each_step() -> None:
         lambda x: (x, prior), in_keys=["logits"], out_keys=[("next", "posterior_logits"), ("next", "prior_logits")]
     )
     records = TensorDict({"logits": logits, "next": {}}, [1, 2])
-    loss, _ = WorldModelLoss(model, free_nats=1.0, unimix=0.0)(records)
+    loss, _ = WeightedModelLoss(model, free_nats=1.0, unimix=0.0)(records)
     torch.testing.assert_close(loss["loss_model_dynamic"], torch.tensor(1.0))
-    loss, _ = WorldModelLoss(model, free_nats=0.0, unimix=0.0)(records)
+    loss, _ = WeightedModelLoss(model, free_nats=0.0, unimix=0.0)(records)
     torch.testing.assert_close(loss["loss_model_dynamic"], torch.tensor(2.0).log() / 2)
 
 
 def test_set_keys_nested(make_agent: Any, records: TensorDict) -> None:
     model = make_agent("dreamer").model
     torch.manual_seed(1)
-    expected, _ = WorldModelLoss(model.records())(records)
+    expected, _ = WeightedModelLoss(model.records())(records)
     rename = TensorDictModule(nn.Identity(), [("next", "reco_proprio")], [("next", "predicted", "proprio")])
     moved = records.clone()
     moved["next", "reward_of", "task"] = moved["next"].pop("reward")
-    loss = WorldModelLoss(TensorDictSequential(model.records(), rename))
+    loss = WeightedModelLoss(TensorDictSequential(model.records(), rename))
     loss.set_keys(reward=("reward_of", "task"), reco_proprio=("predicted", "proprio"))
     torch.manual_seed(1)
     losses, _ = loss(moved)
@@ -119,7 +119,7 @@ def test_set_keys_nested(make_agent: Any, records: TensorDict) -> None:
 
 def test_the_batch_is_left_alone(make_agent: Any, records: TensorDict) -> None:
     before = records.clone()
-    WorldModelLoss(make_agent("dreamer").model.records())(records)
+    WeightedModelLoss(make_agent("dreamer").model.records())(records)
     assert (records == before).all()
     assert set(records.keys(True, True)) == set(before.keys(True, True))
 
@@ -127,7 +127,7 @@ def test_the_batch_is_left_alone(make_agent: Any, records: TensorDict) -> None:
 def test_a_missing_key_is_named(make_agent: Any, records: TensorDict) -> None:
     del records["next", "proprio"]
     with pytest.raises(KeyError, match=r"lacks next.proprio, which the world model reads.*it has action, is_init,"):
-        WorldModelLoss(make_agent().model.records())(records)
+        WeightedModelLoss(make_agent().model.records())(records)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_a_missing_key_is_named(make_agent: Any, records: TensorDict) -> None:
 )
 def test_wrong_shapes(make_agent: Any, records: TensorDict, key: Any, value: torch.Tensor, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        WorldModelLoss(make_agent().model.records())(records.set(key, value))
+        WeightedModelLoss(make_agent().model.records())(records.set(key, value))
 
 
 def test_reconstructions_by_hand() -> None:
@@ -231,7 +231,7 @@ def test_images_in_floating_point(records: TensorDict, name: str, style: Any, dt
 def test_a_weight_without_its_term_is_refused(make_agent: Any, records: TensorDict) -> None:
     world_model = make_agent("dreamer_pcp").model.records()
     with pytest.raises(ValueError, match=r"lambda_goal_position does nothing.*not write next.reco_goal_units"):
-        WorldModelLoss(world_model, lambda_goal_position=9.0)(records)
+        WeightedModelLoss(world_model, lambda_goal_position=9.0)(records)
 
 
 @pytest.mark.parametrize(
@@ -243,17 +243,17 @@ def test_a_weight_without_its_term_is_refused(make_agent: Any, records: TensorDi
         ),
         ({"posterior_logits": "logits"}, "does not write next.logits"),
         ({"reco_goal_position": ("a", "b")}, "does not write next.a.b"),
-        ({"true_reward": "reward"}, "WorldModelLoss does not use the key 'true_reward'"),
+        ({"true_reward": "reward"}, "WeightedModelLoss does not use the key 'true_reward'"),
     ],
 )
 def test_keys_that_would_do_nothing(make_agent: Any, keys: Any, message: str) -> None:
-    loss = WorldModelLoss(make_agent("dreamer_pcp").model.records())
+    loss = WeightedModelLoss(make_agent("dreamer_pcp").model.records())
     with pytest.raises(ValueError, match=message):
         loss.set_keys(**keys)
 
 
 def test_a_mistyped_target_is_named(make_agent: Any, records: TensorDict) -> None:
-    loss = WorldModelLoss(make_agent("dreamer_pcp").model.records())
+    loss = WeightedModelLoss(make_agent("dreamer_pcp").model.records())
     loss.set_keys(proprio="propio")
     with pytest.raises(KeyError, match=r"lacks next.propio, which the world model reads or learns to predict"):
         loss(records)

@@ -31,7 +31,7 @@ from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
 from torchrl_ocwm.training import online as online_module
 from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.online import CollectingClock, Player, collect_seed_steps, train_online
-from torchrl_ocwm.training.run import Sampler
+from torchrl_ocwm.training.run import TrainingBatches
 from torchrl_ocwm.training.settings import Online, Training
 
 HORIZON = 10
@@ -161,7 +161,7 @@ def test_new_episodes_are_sampled(tmp_path: Path) -> None:
     torch.manual_seed(0)
     agent = build_agent("dreamer_pcp", task, "debug")
     with EpisodeDataset.open(tmp_path / "data", write=True) as dataset:
-        sample = Sampler(agent, dataset, Training())
+        sample = TrainingBatches(agent, dataset, Training())
         for new in range(1, 3):
             records = random_records(task, 1, 200, seed=new)[0]
             records["action"].fill_(0.1 * new)[0] = 0

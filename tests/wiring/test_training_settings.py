@@ -162,7 +162,7 @@ def test_goals(run: Callable[..., Run], dataset: EpisodeDataset, goals: str) -> 
     torch.manual_seed(0)
     stored = {tuple(goal) for goal in dataset.records["next", "goal_position"].tolist()}
     agent = build_agent("dreamer", TASK, "debug")
-    sample = runs.Sampler(agent, dataset, Training(goals=goals))  # type: ignore[arg-type]
+    sample = runs.TrainingBatches(agent, dataset, Training(goals=goals))  # type: ignore[arg-type]
     seen = {tuple(goal) for goal in sample()["next", "goal_position"].flatten(0, 1).tolist()}
     assert (seen <= stored) == (goals == "stored")
     assert (seen & stored == set()) == (goals != "stored")

@@ -18,7 +18,7 @@ from torchrl_ocwm.agents.config import Behaviour, Learning
 from torchrl_ocwm.agents.goals import GoalEncoding
 from torchrl_ocwm.agents.rewards import ImaginedReward
 from torchrl_ocwm.agents.scene import Scene
-from torchrl_ocwm.modules import Actor, ImaginationEnv, WorldModel
+from torchrl_ocwm.modules import BoundedNormalActor, ImaginationEnv, RSSMWorldModel
 from torchrl_ocwm.modules.goals import GOAL
 from torchrl_ocwm.modules.networks import make_mlp
 from torchrl_ocwm.objectives import BehaviourLoss
@@ -69,7 +69,7 @@ class LearntBehaviour(nn.Module):
         self.loss = self._make_loss(make_critic(scene, features), source, reward, learning, prefix)
 
     @property
-    def model(self) -> WorldModel:
+    def model(self) -> RSSMWorldModel:
         """The world model that it is learnt in."""
         return self.scene.model
 
@@ -99,7 +99,7 @@ class LearntBehaviour(nn.Module):
 def make_actor(scene: Scene, goal_features: int) -> ProbabilisticTensorDictSequential:
     """A policy on ``latent = {state, belief, goal}``: a bounded normal, whose mean acts unless actions are drawn."""
     size = scene.architecture
-    network = Actor(
+    network = BoundedNormalActor(
         scene.model.latent_features + goal_features,
         scene.task.action,
         **size.mlp,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from torchrl_ocwm.envs.task import Task
-from torchrl_ocwm.modules import WorldModel
+from torchrl_ocwm.modules import RSSMWorldModel
 from torchrl_ocwm.modules.architecture import Architecture
 
 
@@ -19,7 +19,7 @@ class Scene(NamedTuple):
         object_index: Which of the task's objects is to be positioned.
     """
 
-    model: WorldModel
+    model: RSSMWorldModel
     task: Task
     architecture: Architecture
     object_index: int

@@ -8,10 +8,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from torchrl_ocwm.envs.task import Task
-from torchrl_ocwm.modules import FlatWorldModel, ObjectWorldModel, WorkspaceUnits, WorldModel
+from torchrl_ocwm.modules import FlatWorldModel, ObjectWorldModel, RSSMWorldModel, WorkspaceUnits
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.world_model import VectorName
-from torchrl_ocwm.objectives import FOCUSModelLoss, WorldModelLoss
+from torchrl_ocwm.objectives import FOCUSModelLoss, WeightedModelLoss
 from torchrl_ocwm.parts import Part, register
 from torchrl_ocwm.settings import SettingsError, setting
 
@@ -20,7 +20,7 @@ class WorldModelPart(Part, kind="world_model"):
     """How a world model is built, and what trains it."""
 
     @abstractmethod
-    def build(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> WorldModel:
+    def build(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> RSSMWorldModel:
         """The world model.
 
         Args:
@@ -33,7 +33,7 @@ class WorldModelPart(Part, kind="world_model"):
         """
 
     @abstractmethod
-    def loss(self, model: WorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> WorldModelLoss:
+    def loss(self, model: RSSMWorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> WeightedModelLoss:
         """What trains it; ``lambda_dynamic`` is the weight of the KL that trains the prior."""
 
 
@@ -89,9 +89,9 @@ class Flat(_Observing):
         """A world model with one latent, which learns the latents of images alone if a goal needs them."""
         return FlatWorldModel(**self._arguments(task, architecture, needs), image_latent="image_latent" in needs)
 
-    def loss(self, model: WorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> WorldModelLoss:
+    def loss(self, model: RSSMWorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> WeightedModelLoss:
         """What trains it."""
-        return WorldModelLoss(model.records(), **needs.get("image_latent", {}), **self._weights(lambda_dynamic))
+        return WeightedModelLoss(model.records(), **needs.get("image_latent", {}), **self._weights(lambda_dynamic))
 
 
 @register("object")
@@ -104,7 +104,7 @@ class ObjectCentric(_Observing):
         arguments = self._arguments(task, architecture, needs)
         return ObjectWorldModel(**arguments, positional_encoder="positional_encoder" in needs)
 
-    def loss(self, model: WorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> FOCUSModelLoss:
+    def loss(self, model: RSSMWorldModel, needs: Mapping[str, Any], *, lambda_dynamic: float) -> FOCUSModelLoss:
         """What trains it."""
         positional: dict[str, Any] = needs.get("positional_encoder", {})
         return FOCUSModelLoss(model.records(), **positional, **self._weights(lambda_dynamic))

@@ -7,11 +7,11 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm.evaluation.open_loop import open_loop_latents, posterior
-from torchrl_ocwm.modules import ObjectWorldModel, WorldModel
+from torchrl_ocwm.modules import ObjectWorldModel, RSSMWorldModel
 from torchrl_ocwm.objectives.focus import instance_masks
 
 
-def object_errors(model: WorldModel, records: TensorDictBase, context: int) -> dict[str, dict[str, Tensor]]:
+def object_errors(model: RSSMWorldModel, records: TensorDictBase, context: int) -> dict[str, dict[str, Tensor]]:
     """How far off masks and positions are in the frames after the context, step by step.
 
     Args:
@@ -118,7 +118,7 @@ def intersection_over_union(predicted: Tensor, true: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def position_error(model: WorldModel, latents: TensorDictBase, records: TensorDictBase) -> Tensor:
+def position_error(model: RSSMWorldModel, latents: TensorDictBase, records: TensorDictBase) -> Tensor:
     """Distance between the object positions that a world model decodes and the recorded ones.
 
     Args:

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_ocwm.data.dataset import EpisodeDataset
-from torchrl_ocwm.modules import WorldModel
+from torchrl_ocwm.modules import RSSMWorldModel
 
 _SEQUENCES = 10  # at a time: what is decoded on the way takes memory
 
@@ -45,13 +45,13 @@ def random_sequences(dataset: EpisodeDataset, sequences: int, length: int, *, se
 
 
 @torch.no_grad()
-def posterior(model: WorldModel, records: TensorDictBase, *names: str) -> TensorDictBase:
+def posterior(model: RSSMWorldModel, records: TensorDictBase, *names: str) -> TensorDictBase:
     """What a world model makes of records when it sees them all.
 
     Args:
         model: The world model.
         records: ``[N, T]`` records, the first of each sequence with ``is_init`` set.
-        names: What to compute of what :meth:`~torchrl_ocwm.modules.WorldModel.records` writes under ``next``.
+        names: What to compute of what :meth:`~torchrl_ocwm.modules.RSSMWorldModel.records` writes under ``next``.
 
     Returns:
         ``[N, T]`` with these names.
@@ -69,7 +69,7 @@ def posterior(model: WorldModel, records: TensorDictBase, *names: str) -> Tensor
 
 
 @torch.no_grad()
-def open_loop_latents(model: WorldModel, records: TensorDictBase, context: int) -> TensorDictBase:
+def open_loop_latents(model: RSSMWorldModel, records: TensorDictBase, context: int) -> TensorDictBase:
     """Latents of a world model that sees the first frames, and afterwards only the actions.
 
     Args:

@@ -19,7 +19,7 @@ from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.evaluation.objects import decode_objects
 from torchrl_ocwm.evaluation.open_loop import open_loop_latents
 from torchrl_ocwm.evaluation.output import writing
-from torchrl_ocwm.modules import ObjectWorldModel, WorldModel
+from torchrl_ocwm.modules import ObjectWorldModel, RSSMWorldModel
 
 
 def check_ffmpeg(setting: str) -> None:
@@ -94,7 +94,7 @@ def tile(rows: list[Tensor], gap: int = 2) -> Tensor:
 
 
 @torch.no_grad()
-def open_loop_prediction(model: WorldModel, records: TensorDictBase, context: int) -> Tensor:
+def open_loop_prediction(model: RSSMWorldModel, records: TensorDictBase, context: int) -> Tensor:
     """Images that a world model predicts from the first frames and the actions alone.
 
     Args:
@@ -109,12 +109,12 @@ def open_loop_prediction(model: WorldModel, records: TensorDictBase, context: in
 
 
 @torch.no_grad()
-def decode_video(model: WorldModel, latents: TensorDictBase) -> Tensor:
+def decode_video(model: RSSMWorldModel, latents: TensorDictBase) -> Tensor:
     """Videos ``[N, T, 3, H, W]`` uint8 of latents ``[N, T]`` with state and belief, step by step to save memory."""
     return torch.stack([to_uint8(decode_pixels(model, step)) for step in latents.unbind(1)], 1)
 
 
-def decode_pixels(model: WorldModel, latent: TensorDictBase) -> Tensor:
+def decode_pixels(model: RSSMWorldModel, latent: TensorDictBase) -> Tensor:
     """Images ``[..., 3, H, W]`` float32 in [0, 1], unbounded, of latents ``{state, belief}``."""
     return model.pixels(latent["state"], latent["belief"])
 

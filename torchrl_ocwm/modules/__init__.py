@@ -1,7 +1,7 @@
 """What predicts: encoders, world models, goals, imagined rewards, the imagination environment, acting."""
 
 from torchrl_ocwm.modules.acting import ActingLatent
-from torchrl_ocwm.modules.actor import Actor
+from torchrl_ocwm.modules.actor import BoundedNormalActor
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.ensemble import DisagreementReward, OneStepEnsemble, disagreement
 from torchrl_ocwm.modules.future_goals import FutureGoals
@@ -22,12 +22,12 @@ from torchrl_ocwm.modules.rewards import (
 )
 from torchrl_ocwm.modules.temporal_distance import TemporalDistance, TemporalDistanceReward
 from torchrl_ocwm.modules.units import WorkspaceUnits
-from torchrl_ocwm.modules.world_model import FlatWorldModel, WorldModel
+from torchrl_ocwm.modules.world_model import FlatWorldModel, RSSMWorldModel
 
 __all__ = [
     "ActingLatent",
-    "Actor",
     "Architecture",
+    "BoundedNormalActor",
     "DisagreementReward",
     "EntropyReward",
     "FlatWorldModel",
@@ -50,13 +50,13 @@ __all__ = [
     "OneStepEnsemble",
     "PositionDistance",
     "PositionDistanceReward",
+    "RSSMWorldModel",
     "StreamingNorm",
     "TemporalDistance",
     "TemporalDistanceReward",
     "UniformGoals",
     "UnitRMS",
     "WorkspaceUnits",
-    "WorldModel",
     "disagreement",
     "particle_entropy",
     "position_distance",

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torchrl_ocwm.modules.networks import Style, make_mlp
 
 
-class Actor(nn.Module):
+class BoundedNormalActor(nn.Module):
     """Mean and standard deviation of a bounded normal policy, as in DreamerV3.
 
     Args:
@@ -24,7 +24,7 @@ class Actor(nn.Module):
     float32.
 
     Examples:
-        >>> mean, std = Actor(6, 2, layers=1, units=8)(torch.zeros(3, 4), torch.zeros(3, 2))
+        >>> mean, std = BoundedNormalActor(6, 2, layers=1, units=8)(torch.zeros(3, 4), torch.zeros(3, 2))
         >>> mean.shape, bool((std >= 0.1).all())
         (torch.Size([3, 2]), True)
     """

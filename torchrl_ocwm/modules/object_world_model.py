@@ -11,11 +11,11 @@ from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.latent import LatentsInEmbedding, LatentsInImages
 from torchrl_ocwm.modules.networks import make_mlp
 from torchrl_ocwm.modules.objects import LatentPositionalEncoder, ObjectDecoder, ObjectLatentExtractor, compose
-from torchrl_ocwm.modules.world_model import VectorName, WorldModel, key_at, latent_at
+from torchrl_ocwm.modules.world_model import RSSMWorldModel, VectorName, key_at, latent_at
 from torchrl_ocwm.settings import SettingsError
 
 
-class ObjectWorldModel(WorldModel):
+class ObjectWorldModel(RSSMWorldModel):
     """The world model of FOCUS: object latents are extracted from the latent of the scene and decoded one by one.
 
     Colours and masks come from an :class:`~torchrl_ocwm.modules.ObjectDecoder`, positions from an MLP on each object
@@ -27,7 +27,7 @@ class ObjectWorldModel(WorldModel):
         observed: Vectors that the encoder sees.
         positional_encoder: Whether to learn the latent of an object at a position (LCP).
         architecture: Shapes of the networks.
-        kwargs: The other arguments of :class:`~torchrl_ocwm.modules.WorldModel`.
+        kwargs: The other arguments of :class:`~torchrl_ocwm.modules.RSSMWorldModel`.
 
     Raises:
         SettingsError: if the object positions are not observed.

@@ -24,7 +24,7 @@ VectorName = Literal["proprio", "object_position", "goal_position"]
 _KEYS: dict[str, str] = {"proprio": "proprio", "object_position": "object_units", "goal_position": "goal_units"}
 
 
-class WorldModel(nn.Module, ABC):
+class RSSMWorldModel(nn.Module, ABC):
     """Encoder, discrete RSSM, decoders and heads, as TensorDictModules for training, imagination and acting.
 
     The networks exist once; each method gives a module that applies them to the keys of one place:
@@ -194,7 +194,7 @@ class WorldModel(nn.Module, ABC):
         return LatentOfImages(self.prior, self.posterior, state=self.state, belief=self.belief, action=self.action)
 
 
-class FlatWorldModel(WorldModel):
+class FlatWorldModel(RSSMWorldModel):
     """One latent state for the whole scene, from which image and vectors are decoded (Dreamer).
 
     Args:
@@ -202,7 +202,7 @@ class FlatWorldModel(WorldModel):
         observed: Vectors that the encoder sees and the decoder reconstructs.
         architecture: Shapes of the networks.
         image_latent: Whether the latents of images alone are learnt, which are goals then.
-        kwargs: The other arguments of :class:`WorldModel`.
+        kwargs: The other arguments of :class:`RSSMWorldModel`.
 
     Examples:
         >>> from torchrl_ocwm.testing import random_records, reacher_task

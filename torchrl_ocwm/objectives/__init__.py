@@ -4,7 +4,7 @@ from torchrl_ocwm.objectives.dreamer import BehaviourLoss, GoalConditionedDreame
 from torchrl_ocwm.objectives.ensemble import EnsembleLoss
 from torchrl_ocwm.objectives.focus import FOCUSModelLoss, mask_nll, object_reconstruction, positional_latent_loss
 from torchrl_ocwm.objectives.temporal_distance import TemporalDistanceLoss, temporal_pairs
-from torchrl_ocwm.objectives.world_model import WorldModelLoss, image_reconstruction, symlog_reconstruction
+from torchrl_ocwm.objectives.world_model import WeightedModelLoss, image_reconstruction, symlog_reconstruction
 
 __all__ = [
     "BehaviourLoss",
@@ -12,7 +12,7 @@ __all__ = [
     "FOCUSModelLoss",
     "GoalConditionedDreamerLoss",
     "TemporalDistanceLoss",
-    "WorldModelLoss",
+    "WeightedModelLoss",
     "image_reconstruction",
     "mask_nll",
     "object_reconstruction",

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
 from torchrl_ocwm.modules.dtypes import flags, unit_image
-from torchrl_ocwm.objectives.world_model import Term, WorldModelLoss
+from torchrl_ocwm.objectives.world_model import Term, WeightedModelLoss
 from torchrl_ocwm.settings import read
 
 LatentDistance = Literal["cosine", "mse"]
@@ -116,11 +116,11 @@ def positional_latent_loss(
     return (loss * flags(visible, "object_visible")).sum(-1).mean()
 
 
-class FOCUSModelLoss(WorldModelLoss):
+class FOCUSModelLoss(WeightedModelLoss):
     """The world model's loss with a term for each thing that is decoded of an object.
 
-    :class:`~torchrl_ocwm.objectives.WorldModelLoss`, whose image term makes room for masks and masked colours. With a
-    positional encoder the loss that trains it is added.
+    :class:`~torchrl_ocwm.objectives.WeightedModelLoss`, whose image term makes room for masks and masked colours. With
+    a positional encoder the loss that trains it is added.
 
     Args:
         world_model: Reads records ``[B, T]``, writes posterior, prior and predictions under ``next``.
@@ -129,12 +129,12 @@ class FOCUSModelLoss(WorldModelLoss):
         lambda_positional: Weight of L_pos.
         positional_distance: ``"cosine"``, the default, or ``"mse"``.
         positional_gradient: What L_pos trains: ``"encoder"``, ``"latent"`` or ``"both"``, the default.
-        kwargs: The arguments of :class:`~torchrl_ocwm.objectives.WorldModelLoss`, but for ``lambda_pixels``; its
+        kwargs: The arguments of :class:`~torchrl_ocwm.objectives.WeightedModelLoss`, but for ``lambda_pixels``; its
             ``lambda_image_latent`` is about object latents here.
 
     Raises:
-        ValueError: for an unknown distance or gradient, and as :class:`~torchrl_ocwm.objectives.WorldModelLoss` does,
-            for a setting of a term that the world model does not predict.
+        ValueError: for an unknown distance or gradient, and as :class:`~torchrl_ocwm.objectives.WeightedModelLoss`
+            does, for a setting of a term that the world model does not predict.
 
     Examples:
         >>> from torchrl_ocwm.agents import build_agent
@@ -147,8 +147,8 @@ class FOCUSModelLoss(WorldModelLoss):
     """
 
     @dataclass
-    class _AcceptedKeys(WorldModelLoss._AcceptedKeys):
-        """Keys, all under ``next``, beside those of :class:`WorldModelLoss`.
+    class _AcceptedKeys(WeightedModelLoss._AcceptedKeys):
+        """Keys, all under ``next``, beside those of :class:`WeightedModelLoss`.
 
         Attributes:
             masks (NestedKey): True masks, ``[B, T, O, H, W]`` bool. Defaults to ``"masks"``.

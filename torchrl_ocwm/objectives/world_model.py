@@ -111,7 +111,7 @@ class Term(NamedTuple):
     error: Callable[..., Tensor]
 
 
-class WorldModelLoss(DreamerV3ModelLoss):
+class WeightedModelLoss(DreamerV3ModelLoss):
     """TorchRL's DreamerV3 model loss with a weight for each thing that is reconstructed.
 
     Dynamics and representation KL, image and vector reconstruction, reward and continuation, each a ``loss_model_*``
@@ -148,7 +148,7 @@ class WorldModelLoss(DreamerV3ModelLoss):
         >>> from torchrl_ocwm.agents import build_agent
         >>> from torchrl_ocwm.testing import random_records, reacher_task
         >>> agent = build_agent("dreamer_pcp", reacher_task(), size="debug")
-        >>> losses, records = WorldModelLoss(agent.model.records())(random_records(reacher_task(), 2, 5))
+        >>> losses, records = WeightedModelLoss(agent.model.records())(random_records(reacher_task(), 2, 5))
         >>> sorted(losses.keys())
         ['loss_model_continue', 'loss_model_dynamic', 'loss_model_object_position', 'loss_model_pixels', \
 'loss_model_proprio', 'loss_model_representation']

@@ -94,14 +94,14 @@ class RunTrainer(Trainer):
     _saved = -1
 
     def save_trainer(self, force_save: bool = False) -> None:
-        """Save if told to; the trainer's own calls leave it to :class:`Every`."""
+        """Save if told to; the trainer's own calls leave it to :class:`EveryUpdates`."""
         if force_save and self._saved != self.collected_frames:
             self.losses.check(self.collected_frames)
             super().save_trainer(force_save=True)
             self._saved = self.collected_frames
 
 
-class Every:
+class EveryUpdates:
     """Call a function every so many updates, and log what it returns.
 
     Args:

@@ -21,7 +21,7 @@ from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals, make_r
 from torchrl_ocwm.files import only_writer
 from torchrl_ocwm.training.cores import update_threads
 from torchrl_ocwm.training.evaluations import Evaluate, Evaluations
-from torchrl_ocwm.training.hooks import Every, LossLog, ProgressBar, RunTrainer, StopOnSignals, UpdateClock
+from torchrl_ocwm.training.hooks import EveryUpdates, LossLog, ProgressBar, RunTrainer, StopOnSignals, UpdateClock
 from torchrl_ocwm.training.loggers import make_loggers
 from torchrl_ocwm.training.provenance import check_may_go_on, trained_with
 from torchrl_ocwm.training.settings import Training
@@ -66,7 +66,7 @@ class Run:
             torch.set_num_threads(threads)
         torch.manual_seed(training.seed)
         agent.to(training.device).train()
-        sample = Sampler(agent, dataset, training)
+        sample = TrainingBatches(agent, dataset, training)
         stepper = make_stepper(agent, training)
         checkpoint = Archive(
             agent=describe(agent), rng=GlobalRNGState(), metadata={"trained_with": trained_with(training, dataset)}
@@ -105,14 +105,14 @@ class Run:
         trainer.logger = self.loggers = make_loggers(folder, training.loggers, name=folder.name)
         self.loggers.cut_back(self.updates)
         with self.stop as stop, self.bar.running(self.updates, training.updates):
-            Every(trainer, training.checkpoint_interval, self._save, at_end=True)
+            EveryUpdates(trainer, training.checkpoint_interval, self._save, at_end=True)
             evaluations = None
             if evaluate is not None:
                 evaluations = Evaluations(evaluate, look=stop.look, save=self._save_now, loggers=self.loggers)
                 trainer.register_op("post_steps_log", evaluations.check)
-                Every(trainer, training.eval_interval, evaluations.begin)
+                EveryUpdates(trainer, training.eval_interval, evaluations.begin)
             if film is not None:
-                Every(trainer, training.video_interval, partial(self._film, partial(stop.look, film)))
+                EveryUpdates(trainer, training.video_interval, partial(self._film, partial(stop.look, film)))
             trainer.train()
             if evaluations is not None:
                 evaluations.wait()
@@ -138,7 +138,7 @@ class Run:
             )
 
 
-class Sampler:
+class TrainingBatches:
     """Batches ``[B, T]`` for an agent, from a dataset that may grow: the next batch can have what was appended.
 
     Args:
