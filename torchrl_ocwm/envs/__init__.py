@@ -10,6 +10,7 @@ from torchrl_ocwm.envs.opengl import import_mujoco
 if find_spec("mujoco") is not None:
     import_mujoco()  # TorchRL imports it too, and would fail without saying what is missing
 
+from torchrl_ocwm.envs.colour_masks import ColourMasks, largest_component
 from torchrl_ocwm.envs.goal_env import GoalEnv
 from torchrl_ocwm.envs.options import EnvOptions
 from torchrl_ocwm.envs.positions import MaskToPosition, hold_last_seen, mask_centroid, masks_to_positions
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ENVIRONMENTS",
     "Camera",
+    "ColourMasks",
     "CubeMove",
     "EnvChoice",
     "EnvOptions",
@@ -55,6 +57,7 @@ __all__ = [
     "Workspace",
     "find_environment",
     "hold_last_seen",
+    "largest_component",
     "make_env",
     "make_scene",
     "make_task",
