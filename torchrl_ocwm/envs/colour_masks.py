@@ -227,5 +227,6 @@ def _around(image: Tensor, clicks: Tensor, tolerance: int) -> Tensor:
     for column, row in clicks[clicks.isfinite().all(-1)].tolist():
         if not (0 <= column < width and 0 <= row < height):
             raise ValueError(f"the click ({column:g}, {row:g}) is beside the image, which is {width} x {height}")
-        cv2.floodFill(picture, mask, (int(column), int(row)), 0, (tolerance,) * 3, (tolerance,) * 3, how)
+        near = (tolerance,) * 3
+        cv2.floodFill(picture, mask, (int(column), int(row)), (0,), near, near, how)
     return torch.from_numpy(mask[1:-1, 1:-1] > 0).to(image.device)

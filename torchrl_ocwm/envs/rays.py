@@ -28,8 +28,8 @@ def undistort(pixels: Tensor, intrinsics: Tensor, distortion: Tensor) -> Tensor:
         >>> intrinsics = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
         >>> barrel = torch.tensor([-0.2, 0.0, 0.0, 0.0])
         >>> undistort(torch.tensor([[50.0, 50.0], [98.0, 50.0]]), intrinsics, barrel)
-        tensor([[50.0000, 50.0000],
-                [99.... , 50.0000]])
+        tensor([[ 50.0000,  50.0000],
+                [100.5895,  50.0000]])
     """
     check_distortion(distortion)
     k1, k2, p1, p2, k3, k4, k5, k6 = pad(distortion, (0, 8 - distortion.shape[-1])).unsqueeze(-2).unbind(-1)
@@ -67,7 +67,8 @@ def pixel_rays(pixels: Tensor, intrinsics: Tensor, extrinsics: Tensor) -> tuple[
         extrinsics: ``[..., 4, 4]`` camera-to-world matrix (x right, y down, z into the scene), metres.
 
     Returns:
-        Origins ``[..., 1, 3]`` and directions ``[..., N, 3]`` in the world; a direction is 1 long along the optical axis.
+        Origins ``[..., 1, 3]`` and directions ``[..., N, 3]`` in the world; along the optical axis a direction is
+        1 long.
 
     Examples:
         >>> intrinsics = torch.tensor([[10.0, 0, 5], [0, 10, 5], [0, 0, 1]])
