@@ -332,7 +332,7 @@ def kinds(base: type = Settings) -> Iterator[type]:
     """All settings classes of the library and of the recipes."""
     for kind in base.__subclasses__():
         yield from kinds(kind)
-        if kind.__module__.split(".")[0] == "torchrl_ocwm" or kind.__module__.startswith("example_"):
+        if kind.__module__.split(".")[0] == "torchrl_ocwm":
             yield kind
 
 

@@ -110,10 +110,13 @@ def _processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def commit(folder: Path) -> str:
-    """The commit of a checkout, with a plus if it has been changed; the release of what is no checkout."""
+def commit() -> str:
+    """The commit of the checkout that this package is in, with a plus if it has been changed; else its release."""
+    checkout = Path(__file__).parents[2]
     try:
-        git = ["git", "-C", str(folder), "describe", "--always", "--abbrev=8", "--exclude=*", "--dirty=+"]
+        if not (checkout / ".git").exists():  # an installed one may lie in a checkout of something else
+            return version("torchrl-ocwm")
+        git = ["git", "-C", str(checkout), "describe", "--always", "--abbrev=8", "--exclude=*", "--dirty=+"]
         return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return version("torchrl-ocwm")

@@ -10,21 +10,24 @@ from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-import hydra
-from hydra.core.config_store import ConfigStore
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_ocwm.agents import AGENTS, EXPLORERS, SIZES
 from torchrl_ocwm.agents.config import EXPLORE
+from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.parts import Part, load_plugins
 from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
+
+with needs("a recipe", "recipes"):
+    import hydra
+    from hydra.core.config_store import ConfigStore
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+    from omegaconf import DictConfig, OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
 
 T = TypeVar("T")
 #: All groups of options that there are.
@@ -35,10 +38,10 @@ _QUIET = ("job_logging", "hydra_logging")
 def recipe(
     name: str, groups: Mapping[str, str] | None = None, **more: Any
 ) -> Callable[[Callable[[T], None]], Callable[[], None]]:
-    """Make a function of settings the main function of a script that is configured with Hydra.
+    """Make a function of settings the main function of a program that is configured with Hydra.
 
-    The argument of the function is annotated with its settings class. Errors that a user can mend end the script with
-    one line; all others show their traceback (``HYDRA_FULL_ERROR=1`` shows it for all).
+    The argument of the function is annotated with its settings class. Errors that a user can mend end it with one line;
+    all others show their traceback (``HYDRA_FULL_ERROR=1`` shows it for all).
 
     Args:
         name: Name of the recipe.
