@@ -8,8 +8,8 @@ within it not counted. ``--workers 0`` steps the environments in the process tha
 steps consist of. All numbers are medians over rounds; "processor" is the time of all processes together, which says
 more than the others on a machine that does something else too.
 
-``--before`` runs another commit too (one that has ``torchrl_ocwm/recipes/evaluate.py``), in a worktree of git and in turns with this one, and says whether its scores are
-the same, goal by goal.
+``--before`` runs another commit too (one that has ``torchrl_ocwm/recipes/evaluate.py``), in a worktree of git and in
+turns with this one, and says whether its scores are the same, goal by goal.
 """
 
 from __future__ import annotations

@@ -67,6 +67,17 @@ def test_the_words_after_a_command_are_its_recipes(called: Callable[..., list[li
     assert called("train", "agent=focus", "--help") == [["train", "agent=focus", "--help"]]
 
 
+def test_completion_is_installed_without_torch() -> None:
+    """A shell that starts does not wait for it."""
+    code = "import sys; from torchrl_ocwm.console import main; main(); print('torch' in sys.modules)"
+    done = python(code, "-sc", "install=bash")
+    assert "hydra_bash_completion()" in done.stdout, done.stderr
+    assert done.stdout.endswith("False\n")
+    code = "import sys; sys.modules['hydra'] = None; from torchrl_ocwm.console import main; main()"
+    done = python(code, "-sc", "install=bash")
+    assert done.stderr.startswith("ocwm: completion needs hydra, which is not installed: pip install 'torchrl-ocwm[")
+
+
 def test_an_unknown_command(called: Callable[..., list[list[str]]]) -> None:
     with pytest.raises(SystemExit, match=r"^ocwm: there is no 'trian'; there are collect, train, .*\(ocwm --help\)$"):
         called("trian")

@@ -75,7 +75,7 @@ def help_text() -> str:
 def _complete(arguments: list[str]) -> None:
     """Hydra's shell completion: commands are completed here, settings by the recipe of the command."""
     if not any(argument.startswith("query=") for argument in arguments):
-        run("collect")  # it installs the same for all
+        _hydra_alone()
         return
     _, _, typed = os.environ.get("COMP_LINE", "").lstrip().partition(" ")
     command, space, settings = typed.lstrip().partition(" ")
@@ -84,6 +84,15 @@ def _complete(arguments: list[str]) -> None:
     elif command in COMMANDS:
         os.environ["COMP_LINE"] = f"ocwm {settings}"
         run(command)
+
+
+def _hydra_alone() -> None:
+    """What is the same for all commands, and need not wait for PyTorch: each shell that starts asks for it."""
+    try:
+        import hydra
+    except ModuleNotFoundError:
+        sys.exit("ocwm: completion needs hydra, which is not installed: pip install 'torchrl-ocwm[recipes]'")
+    hydra.main(version_base="1.3", config_path=None)(print)()
 
 
 if __name__ == "__main__":
