@@ -30,6 +30,7 @@ test: check
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy --platform win32
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 check: $(INSTALLED)

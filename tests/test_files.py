@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_ocwm.files import FolderInUseError, only_writer, replacing
+from torchrl_ocwm.files import FolderInUseError, as_file_name, only_writer, replacing
 
 
 def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path: Path) -> None:
@@ -35,6 +35,21 @@ def test_contents_reach_the_disk_before_the_name_does(tmp_path: Path, monkeypatc
     with replacing(tmp_path / "a.txt") as new:
         new.write_text("whole")
     assert calls == ["fsync", "replace", "fsync"]
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("training.final_lr=0.1,agent=focus", "training.final_lr=0.1,agent=focus"),
+        ("goals={name: mixed}", "goals={name_ mixed}"),
+        ("output=a/b", "output=a_b"),
+        (r"path=C:\data", "path=C__data"),
+        ('<>|?*"\x00\n', "________"),
+        ("weight=1.", "weight=1_"),
+    ],
+)
+def test_names_that_all_systems_can_have(text: str, name: str) -> None:
+    assert as_file_name(text) == name
 
 
 _HOLD = """

@@ -315,6 +315,12 @@ class TestHydra:
         ]
         assert len({folder for folder, _, _ in seen}) == 4  # each has its own
         assert all("final_lr=0." in folder and agent.world_model for folder, agent, _ in seen)
+        seen.clear()
+        goals = "agent.behaviours.reach.goals={name: mixed, share: 0.3}"
+        command("train_offline", "--multirun", "output=runs", goals, *off)
+        [(folder, _, _)] = seen
+        assert Path(folder).name.startswith("agent.behaviours.reach.goals={name_")  # Windows has no colons in names
+        assert not set(Path(folder).name) & set('<>:"/\\|?*')
 
     def test_keeps_what_it_ran_with(self, tmp_path: Path) -> None:
         keep_settings(Training(updates=3), tmp_path / "run")

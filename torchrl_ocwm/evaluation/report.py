@@ -87,7 +87,7 @@ class Report:
             ReportError: if it is something else.
         """
         try:
-            values = json.loads(Path(file).read_text())
+            values = json.loads(Path(file).read_text(encoding="utf-8"))
             report = cls(torch.tensor(values["goals"]), values["settings"])
             for agent, row in values["agents"].items():
                 runs = row.get("runs", row["sources"])  # older files know runs by their sources only
@@ -218,9 +218,9 @@ class Report:
             OutputError: if they cannot be written; the files of before are then as they were.
         """
         with writing(Path(folder) / "results.json") as file:
-            file.write_text(to_json(self.to_dict()))
+            file.write_text(to_json(self.to_dict()), encoding="utf-8")
         with writing(Path(folder) / "results.md") as file:
-            file.write_text(self.markdown() + "\n")
+            file.write_text(self.markdown() + "\n", encoding="utf-8")
 
 
 def to_json(values: Any) -> str:

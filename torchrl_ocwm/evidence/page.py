@@ -50,7 +50,7 @@ def write_page(wanted: Evidence, results: Sequence[Result], root: Path) -> Path:
     parts += ["## How it was made", _command(wanted), *_making(runs, records)]
     page = folder / "README.md"
     with writing(page) as file:
-        file.write_text("\n\n".join(parts) + "\n")
+        file.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return page
 
 

@@ -197,5 +197,5 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _last_line(file: Path) -> str:
-    lines = file.read_text(errors="replace").strip().splitlines()
+    lines = file.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return lines[-1].rpartition("\r")[2] if lines else "it has said nothing"

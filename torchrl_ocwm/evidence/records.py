@@ -77,7 +77,7 @@ class Record:
             RecordError: if it is none.
         """
         try:
-            return cls(**json.loads(file.read_text()))
+            return cls(**json.loads(file.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError) as error:
             raise RecordError(f"{file}: not the record of a run ({error}); move the folder away") from error
 
@@ -88,7 +88,7 @@ class Record:
             OutputError: if it cannot be written.
         """
         with writing(folder / RECORD) as file:
-            file.write_text(json.dumps(asdict(self), indent=1) + "\n")
+            file.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
 
 
 def machine() -> str:
@@ -103,7 +103,7 @@ def machine() -> str:
 
 def _processor() -> str:
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:  # not Linux
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

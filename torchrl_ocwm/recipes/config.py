@@ -18,6 +18,7 @@ from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
+from torchrl_ocwm.files import as_file_name
 from torchrl_ocwm.parts import Part, load_plugins
 from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
 
@@ -120,9 +121,9 @@ def run_folder(output: str) -> Path:
     hydra_config = HydraConfig.get()
     if hydra_config.mode is not RunMode.MULTIRUN:
         return Path(output)
-    given = {item.lstrip("+").partition("=")[0]: item.replace("/", "_") for item in hydra_config.overrides.task}
+    given = {item.lstrip("+").partition("=")[0]: item for item in hydra_config.overrides.task}
     shown = {"output"} if "output" in given else {"agent", "env", "size", "training.seed"}
-    return Path(output, ",".join(item for key, item in given.items() if key not in shown))
+    return Path(output, as_file_name(",".join(item for key, item in given.items() if key not in shown)))
 
 
 def help_lines(kind: type, at: str = "") -> Iterator[str]:

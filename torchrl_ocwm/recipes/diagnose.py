@@ -65,9 +65,9 @@ def main(config: Diagnose) -> None:
     table = "\n\n".join(part for part in (error_table(errors, agent.task.objects), goal_table(goals)) if part)
     numbers = {"settings": to_dict(config), "objects": agent.task.objects, "errors": errors, "goal_latents": goals}
     with writing(output / "diagnosis.json") as file:
-        file.write_text(to_json(numbers))
+        file.write_text(to_json(numbers), encoding="utf-8")
     with writing(output / "diagnosis.md") as file:
-        file.write_text(table + "\n")
+        file.write_text(table + "\n", encoding="utf-8")
     print(table)
     print(f"\ntable, numbers, pictures: {output}")
 
