@@ -76,6 +76,25 @@ def as_file_name(text: str) -> str:
     return re.sub(r'[<>:"/\\|?*\x00-\x1f]|[. ]$', "_", text)
 
 
+def seen_from(folder: str | Path, path: str | Path) -> str:
+    """A path for a file in a folder to hold: it still leads there when both were moved together.
+
+    It begins with a dot, and has slashes on every system; on another drive of Windows it stays a path of its own.
+
+    Examples:
+        >>> seen_from("outputs/evaluation", "outputs/run/checkpoint.zip")
+        '../run/checkpoint.zip'
+        >>> seen_from("outputs/run", "outputs/run/data"), seen_from("outputs/run", "outputs/run")
+        ('./data', '.')
+    """
+    path = Path(path).resolve()
+    try:
+        text = Path(os.path.relpath(path, Path(folder).resolve())).as_posix()
+    except ValueError:
+        return path.as_posix()
+    return text if text.startswith(".") else f"./{text}"
+
+
 @contextmanager
 def only_writer(folder: str | Path) -> Iterator[None]:
     """Be the only process that writes to a folder; a process that dies gives it back.

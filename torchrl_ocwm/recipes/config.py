@@ -18,7 +18,7 @@ from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
-from torchrl_ocwm.files import as_file_name
+from torchrl_ocwm.files import as_file_name, seen_from
 from torchrl_ocwm.parts import Part, load_plugins
 from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
 
@@ -33,6 +33,7 @@ with needs("a recipe", "recipes"):
 T = TypeVar("T")
 #: All groups of options that there are.
 GROUPS = {"agent", "explore", "size", "env"}
+_PATHS = ("checkpoint", "dataset", "output")
 _QUIET = ("job_logging", "hydra_logging")
 
 
@@ -107,13 +108,19 @@ def _check_choices(groups: Iterable[str], arguments: Iterable[str]) -> None:
 
 
 def keep_settings(settings: Any, folder: Path) -> None:
-    """Keep the settings of a run in its folder, as ``config.yaml``.
+    """Keep the settings of a run in its folder, as ``config.yaml``, with paths as seen from there.
 
     Raises:
         OutputError: if it cannot be written.
     """
     with writing(folder / "config.yaml") as new:
-        OmegaConf.save(OmegaConf.create(to_dict(settings)), new)
+        OmegaConf.save(OmegaConf.create(kept(settings, folder)), new)
+
+
+def kept(settings: Any, folder: Path) -> dict[str, Any]:
+    """Settings for a file in a folder to hold: the paths of a recipe are as seen from there."""
+    plain = to_dict(settings)
+    return {**plain, **{name: seen_from(folder, plain[name]) for name in _PATHS if plain.get(name) is not None}}
 
 
 def run_folder(output: str) -> Path:

@@ -30,9 +30,8 @@ from torchrl_ocwm.evaluation import (
     writing,
 )
 from torchrl_ocwm.modules import ObjectWorldModel
-from torchrl_ocwm.recipes.config import recipe
+from torchrl_ocwm.recipes.config import kept, recipe
 from torchrl_ocwm.recipes.diagnosis_tables import error_table, goal_table
-from torchrl_ocwm.settings import to_dict
 from torchrl_ocwm.signals import ended_by_signals
 
 
@@ -63,7 +62,7 @@ def main(config: Diagnose) -> None:
     torch.manual_seed(settings.seed)
     errors, goals = _errors(agent, records, settings, output), _goals(agent, records, settings, output)
     table = "\n\n".join(part for part in (error_table(errors, agent.task.objects), goal_table(goals)) if part)
-    numbers = {"settings": to_dict(config), "objects": agent.task.objects, "errors": errors, "goal_latents": goals}
+    numbers = {"settings": kept(config, output), "objects": agent.task.objects, "errors": errors, "goal_latents": goals}
     with writing(output / "diagnosis.json") as file:
         file.write_text(to_json(numbers), encoding="utf-8")
     with writing(output / "diagnosis.md") as file:

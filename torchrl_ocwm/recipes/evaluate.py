@@ -104,21 +104,23 @@ def _report(goals: Tensor, settings: Evaluation, include: Sequence[str], more: d
     return report
 
 
-def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dict[str, str]]:
+def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dict[str, Any]]:
     """What a report keeps of each checkpoint: where it is, what is in it, and of what kind its agent is.
 
     Raises:
         SettingsError: for one that would count twice.
     """
-    seen = {run: source for row in report.rows.values() for run, source in zip(row.runs, row.sources, strict=True)}
+    seen: dict[str, str | Path] = {
+        run: source for row in report.rows.values() for run, source in zip(row.runs, row.sources, strict=True)
+    }
     runs = []
     for file, policy in zip(files, policies, strict=True):
         run = sha256(file.read_bytes()).hexdigest()
         if run in seen:
             raise SettingsError(f"{file}: the same run as {seen[run]}, which counts already; leave one of them out")
-        seen[run] = str(file)
+        seen[run] = file
         kind = sha256(json.dumps(describe(policy.agent), sort_keys=True).encode()).hexdigest()
-        runs.append({"source": str(file), "run": run, "kind": kind})
+        runs.append({"source": file, "run": run, "kind": kind})
     return runs
 
 

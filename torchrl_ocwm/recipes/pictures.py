@@ -76,6 +76,6 @@ def picture_episodes(agent: Agent, episodes: TensorDictBase, output: Path) -> No
         draw_errors(output / "errors.png", object_errors(agent.model, records, context), agent.task.objects)
 
 
-def _folders(sources: list[str]) -> list[Path]:
+def _folders(sources: list[str | Path]) -> list[Path]:
     """Where the runs of a row logged; random actions have no run."""
-    return [Path(source).parent for source in sources if source.endswith(CHECKPOINT)]
+    return [Path(source).parent for source in sources if str(source).endswith(CHECKPOINT)]
