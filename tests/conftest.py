@@ -30,6 +30,7 @@ REQUIRED = {
     "evaluate": ["checkpoint=a.zip"],
     "diagnose": ["checkpoint=a.zip", "dataset=data"],
     "reproduce": ["figure=table"],
+    "share": ["evaluation=there"],
 }
 
 # A shell that runs the tests in the background lets them, and what they start, ignore Ctrl-C.

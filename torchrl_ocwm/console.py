@@ -19,6 +19,7 @@ COMMANDS = {
     "evaluate": ("evaluate", "Score agents on a grid of goals; tables, pictures, videos."),
     "diagnose": ("diagnose", "Look into a world model: masks, positions, goal latents."),
     "reproduce": ("reproduce", "Make a table or figure of the paper, from nothing."),
+    "share": ("share", "Make a trained agent ready for others."),
 }
 _HELP, _COMPLETION = ("-h", "--help"), ("-sc", "--shell-completion")
 

@@ -62,9 +62,9 @@ def main(config: Diagnose) -> None:
     torch.manual_seed(settings.seed)
     errors, goals = _errors(agent, records, settings, output), _goals(agent, records, settings, output)
     table = "\n\n".join(part for part in (error_table(errors, agent.task.objects), goal_table(goals)) if part)
-    numbers = {"settings": kept(config, output), "objects": agent.task.objects, "errors": errors, "goal_latents": goals}
+    numbers = {"objects": agent.task.objects, "errors": errors, "goal_latents": goals}
     with writing(output / "diagnosis.json") as file:
-        file.write_text(to_json(numbers), encoding="utf-8")
+        file.write_text(to_json({"settings": kept(config, output), **numbers}), encoding="utf-8")
     with writing(output / "diagnosis.md") as file:
         file.write_text(table + "\n", encoding="utf-8")
     print(table)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchrl_ocwm import load_agent
-from torchrl_ocwm.agents import Policy, agent_name, describe
+from torchrl_ocwm.agents import Policy, agent_file, agent_name, describe
 from torchrl_ocwm.data import SmoothRandomPolicy
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.evaluation import Evaluation, EvaluationEnvs, Footage, Report, check_ffmpeg, goal_images, measure
@@ -32,7 +32,8 @@ class Evaluate(Evaluation):
     """Settings of the recipe.
 
     Args:
-        checkpoint: Checkpoint, or list of them: those of one agent count as its seeds, each agent is a row.
+        checkpoint: Checkpoint or trained agent, as ``load_agent`` takes it, or list of them: those of one agent count
+            as its seeds, each agent is a row.
         include: ``results.json`` of earlier evaluations with the same goals and settings, whose rows come first.
         output: Folder for table, numbers, heatmaps, learning curve and video.
     """
@@ -55,7 +56,8 @@ def main(config: Evaluate) -> None:
     settings = config
     if settings.video_goals:
         check_ffmpeg("video_goals")
-    files = [Path(one) for one in ([config.checkpoint] if isinstance(config.checkpoint, str) else config.checkpoint)]
+    names = (config.checkpoint,) if isinstance(config.checkpoint, str) else config.checkpoint
+    files = [agent_file(one) for one in names]
     policies = [load_agent(file, behaviour=settings.behaviour) for file in files]
     task, about, output = _one_task(policies, files), policies[0].object_index, Path(config.output)
     goals = task.workspace.grid(settings.grid_size).flatten(0, 1)
@@ -63,7 +65,7 @@ def main(config: Evaluate) -> None:
     if settings.image_goals or not all(policy.takes_positions for policy in policies):
         images = goal_images(task, goals, object_index=about)
     report = _report(goals, settings, config.include, {"object": task.objects[about]} if about else {})
-    runs = _runs(files, policies, report)
+    runs = _runs(names, files, policies, report)
     chosen = torch.linspace(0, len(goals) - 1, min(settings.video_goals, settings.goals)).round().long()
     footage: dict[str, Footage] = {}
     with EvaluationEnvs(
@@ -104,7 +106,7 @@ def _report(goals: Tensor, settings: Evaluation, include: Sequence[str], more: d
     return report
 
 
-def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dict[str, Any]]:
+def _runs(names: Sequence[str], files: list[Path], policies: list[Policy], report: Report) -> list[dict[str, Any]]:
     """What a report keeps of each checkpoint: where it is, what is in it, and of what kind its agent is.
 
     Raises:
@@ -114,13 +116,13 @@ def _runs(files: list[Path], policies: list[Policy], report: Report) -> list[dic
         run: source for row in report.rows.values() for run, source in zip(row.runs, row.sources, strict=True)
     }
     runs = []
-    for file, policy in zip(files, policies, strict=True):
+    for name, file, policy in zip(names, files, policies, strict=True):
         run = sha256(file.read_bytes()).hexdigest()
         if run in seen:
             raise SettingsError(f"{file}: the same run as {seen[run]}, which counts already; leave one of them out")
         seen[run] = file
         kind = sha256(json.dumps(describe(policy.agent), sort_keys=True).encode()).hexdigest()
-        runs.append({"source": file, "run": run, "kind": kind})
+        runs.append({"source": file if Path(name).exists() else name, "run": run, "kind": kind})
     return runs
 
 

@@ -46,7 +46,7 @@ def score(
 
     episodes = envs.run(policy, goals, images=images, seed=seed, inspect=inspect, progress=True)
     errors = {name: episodes[name].mean(1) for name in ("entity_error", "goal_error") if name in episodes}
-    if "object_position" in policy.agent.model.observed:
+    if "object_position" in policy.agent.model.decoded:
         errors["imagined_distance"] = imagined_distance(
             policy.behaviour,
             episodes["latent"][:, 0],

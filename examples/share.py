@@ -1,0 +1,6 @@
+"""``ocwm share`` as a script: ``python examples/share.py`` takes the same settings."""
+
+from torchrl_ocwm.console import run
+
+if __name__ == "__main__":
+    run("share")
