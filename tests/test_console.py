@@ -119,6 +119,25 @@ def test_exit_codes_and_help_in_another_folder(ocwm: Path, tmp_path: Path) -> No
     assert "training.updates=10000: Updates of model, actor and critic in all." in shown.stdout.splitlines()
 
 
+def test_help_of_which_nobody_reads_more(ocwm: Path) -> None:
+    """As with ``| head``."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([ocwm, "train", "--help"], stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_pipe_that_breaks_otherwise_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr("torchrl_ocwm.recipes.collect.main", fail)
+    monkeypatch.setattr(sys, "argv", ["ocwm", "steps=1"])
+    with pytest.raises(BrokenPipeError):
+        console.run("collect")
+
+
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda file: file.stem)
 def test_an_example_is_a_command_and_nothing_else(example: Path) -> None:
     calls = [node for node in ast.walk(ast.parse(example.read_text())) if isinstance(node, ast.Call)]

@@ -81,7 +81,9 @@ def contents(wheel: Path) -> dict[str, bytes]:
 
 
 def test_the_wheel_has_the_package_and_nothing_else(wheel: Path) -> None:
-    ours = {file.relative_to(ROOT).as_posix() for file in PACKAGE.rglob("*.py")} | {"torchrl_ocwm/py.typed"}
+    files = [file for file in PACKAGE.rglob("*") if file.is_file() and file.parent.name != "__pycache__"]
+    ours = {file.relative_to(ROOT).as_posix() for file in files}
+    assert "torchrl_ocwm/py.typed" in ours
     about = f"torchrl_ocwm-{__version__}.dist-info"
     assert {name for name in contents(wheel) if not name.startswith(f"{about}/")} == ours
     assert contents(wheel)[f"{about}/licenses/LICENSE"] == (ROOT / "LICENSE").read_bytes()

@@ -48,7 +48,12 @@ def run(command: str) -> None:
         recipe = import_module(f"torchrl_ocwm.recipes.{COMMANDS[command][0]}")
     except UserError as error:
         sys.exit(f"{type(error).__name__}: {error}")
-    recipe.main()
+    try:
+        recipe.main()
+    except BrokenPipeError:
+        if not {*_HELP} & {*sys.argv}:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # who reads the help, like head, has seen enough
 
 
 def help_text() -> str:

@@ -118,7 +118,7 @@ def keep_settings(settings: Any, folder: Path) -> None:
 
 
 def kept(settings: Any, folder: Path) -> dict[str, Any]:
-    """Settings for a file in a folder to hold: the paths of a recipe, but for what is no file, are as seen from there."""
+    """Settings for a file in a folder to hold: paths of what is there are as seen from that folder."""
     plain = to_dict(settings)
     there = [name for name in _PATHS if plain.get(name) is not None and Path(plain[name]).exists()]
     return {**plain, **{name: seen_from(folder, plain[name]) for name in there}}
