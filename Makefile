@@ -33,6 +33,7 @@ test: check
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy --platform win32
 	$(MAKE) test-next
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
@@ -63,14 +64,14 @@ $(NEXT)/.installed: $(INSTALLED) Makefile
 	@touch $@
 
 $(DEMO)/dataset/.done:
-	$(BIN)/python examples/collect.py env=reacher steps=$(STEPS) workers=$(WORKERS) dataset=$(@D)
+	$(BIN)/ocwm collect env=reacher steps=$(STEPS) workers=$(WORKERS) dataset=$(@D)
 	@touch $@
 
 $(DEMO)/focus_lcp/.done: $(DEMO)/dataset/.done
-	$(BIN)/python examples/train_offline.py agent=focus_lcp env=reacher size=cpu \
+	$(BIN)/ocwm train agent=focus_lcp env=reacher size=cpu \
 		dataset=$(<D) output=$(@D) training.updates=$(UPDATES) training.eval_interval=250 training.video_interval=500
 	@touch $@
 
 $(DEMO)/evaluation/.done: $(DEMO)/focus_lcp/.done
-	$(BIN)/python examples/evaluate.py checkpoint=$(<D)/checkpoint.zip goals=100 image_goals=true output=$(@D)
+	$(BIN)/ocwm evaluate checkpoint=$(<D)/checkpoint.zip goals=100 image_goals=true output=$(@D)
 	@touch $@

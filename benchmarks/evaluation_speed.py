@@ -3,20 +3,19 @@
     MUJOCO_GL=egl python benchmarks/evaluation_speed.py CHECKPOINT [--goals 100] [--steps 150] [--rounds 3]
         [--workers 2] [--image-goals] [--before COMMIT]
 
-Runs ``examples/evaluate.py`` with the library's functions timed: seconds that pass in each part, those of the parts
+Runs ``ocwm evaluate`` with the library's functions timed: seconds that pass in each part, those of the parts
 within it not counted. ``--workers 0`` steps the environments in the process that evaluates, which shows what their
 steps consist of. All numbers are medians over rounds; "processor" is the time of all processes together, which says
 more than the others on a machine that does something else too.
 
-``--before`` runs another commit too, in a worktree of git and in turns with this one, and says whether its scores are
-the same, goal by goal.
+``--before`` runs another commit too (one that has ``torchrl_ocwm/recipes/evaluate.py``), in a worktree of git and in
+turns with this one, and says whether its scores are the same, goal by goal.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import importlib.util
 import json
 import os
 import resource
@@ -37,7 +36,7 @@ from update_speed import ROOT, checkout, line
 #: Part → functions, ``module:name``, that do it. What none of them does is "everything else".
 PARTS = {
     "start of processes": ["processes:ProcessWorker.ready"],
-    "goal images": ["examples:goal_images"],
+    "goal images": ["recipes.evaluate:goal_images"],
     "episodes, beside the next three": ["evaluation.episodes:EvaluationEnvs.run"],
     "policy": ["agents.agent:Policy.forward", "data.policies:SmoothRandomPolicy.forward"],
     "reconstruction errors": ["evaluation.reconstruction:ReconstructionError.__call__"],
@@ -49,10 +48,10 @@ PARTS = {
     "  rendering": ["envs.camera:Camera.render"],
     "  positions from masks": ["envs.positioning:masks_to_positions"],
     "  physics, rest of the environment": ["envs.positioning:PositioningEnv.step"],
-    "imagined distances": ["examples:imagined_distance"],
-    "heatmap, learning curves": ["examples:heatmap", "examples:learning_curves"],
-    "films": ["examples:_film"],
-    "pictures of objects": ["examples:_picture_objects"],
+    "imagined distances": ["recipes.scores:imagined_distance"],
+    "heatmap, learning curves": ["recipes.evaluate:draw"],
+    "films": ["recipes.evaluate:film"],
+    "pictures of objects": ["recipes.evaluate:picture_episodes"],
     "writing of videos": ["evaluation.videos:write_video", "evaluation.object_pictures:write_video"],
 }
 WHOLE = ("start of processes",)  # parts within count to it
@@ -95,26 +94,20 @@ class Clock:
         setattr(owner, function, timed)
 
 
-def evaluate(folder: str, *arguments: str) -> None:
-    """Evaluate with the library and the example of a folder, and print the seconds of each part as JSON."""
+def evaluate(*arguments: str) -> None:
+    """Evaluate with the library that is on the path, and print the seconds of each part as JSON."""
     clock = Clock()
     with clock.part(ELSE):
-        example = Path(folder, "examples", "evaluate.py")
-        specification = importlib.util.spec_from_file_location("examples", example)
-        assert specification is not None
-        assert specification.loader is not None
-        sys.modules["examples"] = module = importlib.util.module_from_spec(specification)
-        specification.loader.exec_module(module)
         for name, functions in PARTS.items():
             for place in functions:
                 room, _, path = place.partition(":")
-                owner: Any = module if room == "examples" else importlib.import_module(f"torchrl_ocwm.{room}")
+                owner: Any = importlib.import_module(f"torchrl_ocwm.{room}")
                 *classes, function = path.split(".")
                 for one in classes:
                     owner = getattr(owner, one)
                 clock.watch(owner, function, name)
-        sys.argv = [str(example), *arguments]
-        module.main()
+        sys.argv = ["ocwm", *arguments]
+        importlib.import_module("torchrl_ocwm.recipes.evaluate").main()
     print("\n" + json.dumps(clock.seconds))
 
 
@@ -129,13 +122,7 @@ def measure(folder: Path, arguments: argparse.Namespace) -> tuple[dict[str, floa
             "image_goals": arguments.image_goals,
             "output": output,
         }
-        command = [
-            sys.executable,
-            __file__,
-            "--child",
-            str(folder),
-            *(f"{key}={value}" for key, value in given.items()),
-        ]
+        command = [sys.executable, __file__, "--child", *(f"{key}={value}" for key, value in given.items())]
         environment = {**os.environ, "PYTHONPATH": str(folder)}
         before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

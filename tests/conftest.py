@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from importlib.util import module_from_spec, spec_from_file_location
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,13 +18,13 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_ocwm.agents import AGENTS, EXPLORERS, SIZES, Agent, build_agent
+from torchrl_ocwm.console import COMMANDS
 from torchrl_ocwm.envs import ENVIRONMENTS
 from torchrl_ocwm.parts import Part
 from torchrl_ocwm.recipes import config as recipes
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records, reacher_task
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
 #: What a command of a recipe has to say, whatever else it says.
 REQUIRED = {
     "evaluate": ["checkpoint=a.zip"],
@@ -113,15 +113,8 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def scripts() -> dict[str, ModuleType]:
-    """The scripts of the recipes as modules: to run one here saves the seconds that a process takes to start."""
-    modules = {}
-    for name in ("collect", "train_offline", "train_online", "evaluate", "diagnose", "reproduce", "share"):
-        spec = spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
-        assert spec is not None
-        assert spec.loader is not None
-        modules[name] = sys.modules[spec.name] = module_from_spec(spec)
-        spec.loader.exec_module(modules[name])
-    return modules
+    """The recipes by the names of their modules: to run one here saves the seconds that a process takes to start."""
+    return {name: import_module(f"torchrl_ocwm.recipes.{name}") for name, _ in COMMANDS.values()}
 
 
 @pytest.fixture
@@ -131,13 +124,13 @@ def command(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> Callable[..., str]:
-    """Run a script with arguments in an empty folder; what it says if it ends with an error, or what it prints."""
+    """Run a recipe with arguments in an empty folder; what it says if it ends with an error, or what it prints."""
     monkeypatch.chdir(tmp_path)
 
     def run(script: str, *arguments: str) -> str:
         names = {argument.partition("=")[0] for argument in arguments}
         required = [one for one in REQUIRED.get(script, []) if one.partition("=")[0] not in names]
-        monkeypatch.setattr(sys, "argv", [f"{script}.py", *required, *arguments])
+        monkeypatch.setattr(sys, "argv", ["ocwm", *required, *arguments])
         try:
             scripts[script].main()
         except SystemExit as stop:
@@ -155,7 +148,7 @@ class Composed(BaseException):
 
 @pytest.fixture
 def compose(command: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-    """The settings that a script would run with, or what it says of a value that it refuses."""
+    """The settings that a recipe would run with, or what it says of a value that it refuses."""
     read = recipes.from_dict
 
     def stop(*arguments: Any) -> Any:

@@ -118,5 +118,5 @@ def below(kind: type) -> Iterator[type]:
 
 def recipes_of(kind: type) -> set[str]:
     """The settings classes of recipes below a class, which have its settings too."""
-    text = "".join(script.read_text() for script in (ROOT / "examples").glob("*.py"))
+    text = "".join(script.read_text() for script in (ROOT / "torchrl_ocwm" / "recipes").glob("*.py"))
     return set(re.findall(rf"class (\w+)\([^)]*\b{kind.__name__}\b[^)]*\)", text))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_ocwm.files import FolderInUseError, only_writer, replacing
+from torchrl_ocwm.files import FolderInUseError, as_file_name, only_writer, replacing, seen_from
 
 
 def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path: Path) -> None:
@@ -37,6 +37,21 @@ def test_contents_reach_the_disk_before_the_name_does(tmp_path: Path, monkeypatc
     assert calls == ["fsync", "replace", "fsync"]
 
 
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("training.final_lr=0.1,agent=focus", "training.final_lr=0.1,agent=focus"),
+        ("goals={name: mixed}", "goals={name_ mixed}"),
+        ("output=a/b", "output=a_b"),
+        (r"path=C:\data", "path=C__data"),
+        ('<>|?*"\x00\n', "________"),
+        ("weight=1.", "weight=1_"),
+    ],
+)
+def test_names_that_all_systems_can_have(text: str, name: str) -> None:
+    assert as_file_name(text) == name
+
+
 _HOLD = """
 import sys, time
 from torchrl_ocwm.files import only_writer
@@ -58,3 +73,22 @@ def test_the_second_writer_is_refused_until_the_first_is_dead(tmp_path: Path) ->
         first.wait()
         with only_writer(tmp_path):
             assert (tmp_path / ".lock_owner").read_text() == str(os.getpid())
+
+
+def test_paths_of_what_is_moved_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("here", "there"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert seen_from("run", "run/data/frames") == "./data/frames"
+    assert seen_from("run", tmp_path / "there" / "data") == "../../there/data"
+    (tmp_path / "link").symlink_to(tmp_path / "there" / "deep")
+    (tmp_path / "there" / "deep").mkdir()
+    assert seen_from(tmp_path / "link", tmp_path / "there" / "a") == "../a"  # and not beside the link
+
+
+def test_a_path_on_another_drive_stays_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(path: Path, start: Path) -> str:
+        raise ValueError("path is on mount 'D:', start on mount 'C:'")
+
+    monkeypatch.setattr(os.path, "relpath", fail)
+    assert seen_from("run", tmp_path / "data") == (tmp_path / "data").resolve().as_posix()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -53,15 +54,45 @@ def replacing(path: str | Path) -> Iterator[Path]:
 def sync(path: Path) -> None:
     """Wait until a file's contents, or a folder's entries, are on the disk."""
     try:
-        descriptor = os.open(path, os.O_RDONLY)
+        # Windows waits only for what is open for writing, and opens no folders.
+        descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     except PermissionError:
         if path.is_dir():
-            return  # Windows opens no folders, and keeps their entries by itself
+            return  # Windows, which keeps their entries by itself
         raise
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def as_file_name(text: str) -> str:
+    r"""A text with ``_`` for everything that the file names of some system may not have.
+
+    Examples:
+        >>> as_file_name("goals={name: mixed},path=a/b")
+        'goals={name_ mixed},path=a_b'
+    """
+    return re.sub(r'[<>:"/\\|?*\x00-\x1f]|[. ]$', "_", text)
+
+
+def seen_from(folder: str | Path, path: str | Path) -> str:
+    """A path for a file in a folder to hold: it still leads there when both were moved together.
+
+    It begins with a dot, and has slashes on every system; on another drive of Windows it stays a path of its own.
+
+    Examples:
+        >>> seen_from("outputs/evaluation", "outputs/run/checkpoint.zip")
+        '../run/checkpoint.zip'
+        >>> seen_from("outputs/run", "outputs/run/data"), seen_from("outputs/run", "outputs/run")
+        ('./data', '.')
+    """
+    path = Path(path).resolve()
+    try:
+        text = Path(os.path.relpath(path, Path(folder).resolve())).as_posix()
+    except ValueError:
+        return path.as_posix()
+    return text if text.startswith(".") else f"./{text}"
 
 
 @contextmanager
@@ -85,12 +116,12 @@ def only_writer(folder: str | Path) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout:
-        who = owner.read_text() if owner.exists() else "unknown"
+        who = owner.read_text(encoding="utf-8") if owner.exists() else "unknown"
         raise FolderInUseError(
             f"{folder}: process {who} is writing here; wait until it has ended, or choose another folder"
         ) from None
     try:
-        owner.write_text(str(os.getpid()))
+        owner.write_text(str(os.getpid()), encoding="utf-8")
         yield
     finally:
         owner.unlink(missing_ok=True)

@@ -1,6 +1,6 @@
 r"""Train TorchRL's own DreamerV3 with the object terms of FOCUS in its model loss.
 
-    python examples/collect.py env=reacher steps=50000 dataset=data/reacher
+    ocwm collect env=reacher steps=50000 dataset=data/reacher
     python examples/compose/focus_terms_in_dreamer_v3.py data/reacher
 
 Networks, losses, optimiser and update are TorchRL's. From here come the modules that decode each object by itself

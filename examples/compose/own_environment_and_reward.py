@@ -4,7 +4,7 @@ Each is registered under a name, by which everything else calls it. The script c
 agent of the smallest size and scores it beside random actions. The recipes take the names too, once told the module:
 
     export TORCHRL_OCWM_PLUGINS=own_environment_and_reward PYTHONPATH=examples/compose
-    python examples/train_offline.py env=disc agent=near_disc dataset=outputs/disc/data training.eval_episodes=4
+    ocwm train env=disc agent=near_disc dataset=outputs/disc/data training.eval_episodes=4
 """
 
 from __future__ import annotations

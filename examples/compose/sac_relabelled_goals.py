@@ -3,7 +3,7 @@ r"""Train TorchRL's soft actor-critic from vectors, with goals relabelled in hin
     python examples/compose/sac_relabelled_goals.py --steps 20000 --output outputs/reacher/sac
 
 Loss, collector and hindsight replay are TorchRL's, the environment is this library's. It renders, as it reads the
-object's position from the masks, but no network sees an image. The scores are those of ``examples/evaluate.py``:
+object's position from the masks, but no network sees an image. The scores are those of ``ocwm evaluate``:
 ``results.json`` and ``results.md`` have those at the end, ``log`` has the curve.
 """
 

@@ -34,6 +34,14 @@ def test_context_that_cannot_be_made(monkeypatch):
     assert MODEL.vis.global_.offwidth == before
 
 
+@pytest.mark.parametrize("system", ["darwin", "win32"])
+def test_on_other_systems(monkeypatch, system):
+    monkeypatch.setattr(sys, "platform", system)
+    message = str(opengl.renderer_error(RuntimeError("invalid value for environment variable MUJOCO_GL: egl")))
+    assert message.endswith("Leave MUJOCO_GL unset, so that MuJoCo takes this system's own OpenGL.")
+    assert "apt-get" not in message
+
+
 def test_import_that_fails(monkeypatch):
     def fail(name):
         raise AttributeError("'NoneType' object has no attribute 'glGetError'")

@@ -9,6 +9,7 @@ from typing import Any, get_args, get_type_hints
 import pytest
 
 from torchrl_ocwm.agents import AGENTS, SIZES
+from torchrl_ocwm.console import COMMANDS
 from torchrl_ocwm.envs import ENVIRONMENTS
 from torchrl_ocwm.evidence import BUDGETS, FIGURES, SETUPS, Evaluated, Evidence, Machine, Run, in_order, results
 from torchrl_ocwm.settings import SettingsError, change, from_dict, to_dict
@@ -76,16 +77,16 @@ def test_commands_say_what_runs_are(compose: Callable[..., Any]) -> None:
     """The settings that a recipe reads from the command of a run are those by which the run is found."""
     every = {run.name: run for figure in FIGURES for run in runs(figure, size="debug")}
     for run in every.values():
-        for script, *arguments in run.commands(ROOT, Machine(threads=3)):
-            config, content = compose(script.removesuffix(".py"), *arguments), run.content
+        for command, *arguments in run.commands(ROOT, Machine(threads=3)):
+            config, content = compose(COMMANDS[command][0], *arguments), run.content
             assert not isinstance(config, str), config
-            if script == "evaluate.py":
+            if command == "evaluate":
                 assert config.checkpoint == str(ROOT / run.needs[0].name / "checkpoint.zip")
                 asked = ("goals", "episode_steps", "image_goals", "random", "seed")
                 assert {name: content[name] for name in asked} == {name: getattr(config, name) for name in asked}
                 continue
             assert getattr(config, "seed", None) == content.get("seed") or config.training.seed == content["seed"]
-            if script == "train_offline.py":
+            if command == "train":
                 assert (config.agent, config.size) == (content["agent"], content["size"])
                 assert config.training.deciding() == content["training"].deciding()
                 assert config.training.updates == content["training"].updates
@@ -95,7 +96,7 @@ def test_commands_say_what_runs_are(compose: Callable[..., Any]) -> None:
                 continue
             options = ENVIRONMENTS[config.env.name].options
             assert from_dict(options, config.env.options) == content["options"]
-            if script == "train_online.py":
+            if command == "train-online":
                 assert (config.agent, config.size) == (content["agent"], content["size"])
                 assert config.online == content["online"]
 

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 
+from torchrl_ocwm.console import COMMANDS
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation import Report
 from torchrl_ocwm.evaluation.report import ReportError
@@ -60,7 +61,7 @@ def work(command: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path:
 
     def run(job: Any, arguments: Any, *_: Any) -> None:
         done.append(job.folder.parent.name)
-        said = command(arguments[0].removesuffix(".py"), *arguments[1:])
+        said = command(COMMANDS[arguments[0]][0], *arguments[1:])
         if "Error" in said:
             raise RunFailedError(said)
 
@@ -69,7 +70,7 @@ def work(command: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path:
     def go(wanted: list[Result]) -> list[str]:
         done.clear()
         runs = in_order(one.evaluated for one in wanted)
-        work_off(runs, tmp_path, tmp_path, Machine(), Here())
+        work_off(runs, tmp_path, Machine(), Here())
         return list(done)
 
     return go

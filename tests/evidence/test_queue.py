@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from torchrl_ocwm.errors import MissingPackageError
-from torchrl_ocwm.evidence import LAUNCHERS, Machine, Record, Run, RunFailedError, in_order, launchers, work_off
+from torchrl_ocwm.evidence import LAUNCHERS, Machine, Record, Run, RunFailedError, in_order, launchers, queue, work_off
 from torchrl_ocwm.evidence.runs import Command
 
 #: Says that it has begun, in the order of all, and then does what its name says.
@@ -25,7 +25,7 @@ SCRIPT = """
 import signal, sys, time
 from pathlib import Path
 
-order, name, what = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
+order, name, what = Path(sys.argv[2]), sys.argv[3], sys.argv[4]
 
 def end(number, frame):
     order.with_name(name + ".stopped").touch()
@@ -78,26 +78,28 @@ class Stub(Run):
         return self.after
 
     def commands(self, root: Path, machine: Machine) -> list[Command]:
-        return [("stub.py", str(root / "order"), self.title, self.what)]
+        return [("stub", str(root / "order"), self.title, self.what)]
 
     def reached(self, root: Path) -> int:
         return self.does
 
 
-@pytest.fixture
-def scripts_folder(tmp_path: Path) -> Path:
-    (tmp_path / "scripts").mkdir()
-    (tmp_path / "scripts" / "stub.py").write_text(SCRIPT)
-    return tmp_path / "scripts"
+@pytest.fixture(autouse=True)
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The script is what does runs."""
+    (tmp_path / "modules").mkdir()
+    (tmp_path / "modules" / "queue_program.py").write_text(SCRIPT)
+    monkeypatch.setattr(queue, "PROGRAM", "queue_program")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "modules"), os.environ.get("PYTHONPATH", "")]))
 
 
 @pytest.fixture
-def work(tmp_path: Path, scripts_folder: Path) -> Callable[..., list[str]]:
+def work(tmp_path: Path) -> Callable[..., list[str]]:
     """Work off runs and what they need; what was begun so far, in its order."""
 
     def go(*runs: Run, workers: int = 1) -> list[str]:
         how = Machine(workers=workers)
-        work_off(in_order(runs), tmp_path, scripts_folder, how, LAUNCHERS["local"](how))
+        work_off(in_order(runs), tmp_path, how, LAUNCHERS["local"](how))
         return begun(tmp_path)
 
     return go
@@ -123,7 +125,7 @@ def test_what_is_needed_is_done_first_and_nothing_twice(work: Callable[..., list
     assert record.done
     assert record.seconds > 0
     assert record.machine
-    assert record.commands == [["stub.py", str(tmp_path / "order"), "last", "end"]]
+    assert record.commands == [["stub", str(tmp_path / "order"), "last", "end"]]
     assert work(last, second) == ["data", "first", "last", "second"]
     assert work(last, Stub(title="new", after=(second,)))[4:] == ["new"]
 
@@ -144,7 +146,7 @@ def test_a_run_that_fails_keeps_back_only_those_that_need_it(work: Callable[...,
     assert "(bad cannot be done; all of it: " in message
     assert message.endswith("log.txt)")
     assert not Record.of(bad, tmp_path).done
-    assert "stub.py" in (tmp_path / bad.name / "log.txt").read_text()
+    assert "$ ocwm stub " in (tmp_path / bad.name / "log.txt").read_text()
 
 
 def test_a_run_that_has_ended_early_is_not_done(work: Callable[..., list[str]], tmp_path: Path) -> None:
@@ -157,9 +159,7 @@ def test_a_run_that_has_ended_early_is_not_done(work: Callable[..., list[str]], 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["local", "ray"])
-def test_several_at_a_time(
-    launcher: Literal["local", "ray"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scripts_folder: Path
-) -> None:
+def test_several_at_a_time(launcher: Literal["local", "ray"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Two that wait for ever are both at work."""
     if launcher == "ray":
         pytest.importorskip("ray")
@@ -176,7 +176,7 @@ def test_several_at_a_time(
 
     monkeypatch.setattr("torchrl_ocwm.evidence.queue.wait", watch)
     with pytest.raises(Enough):
-        work_off(runs, tmp_path, scripts_folder, how, where)
+        work_off(runs, tmp_path, how, where)
     # Whatever ends the queue tells its processes to end, and waits for them.
     assert sorted(begun(tmp_path)) == ["one", "two"]
     assert {file.name for file in tmp_path.glob("*.stopped")} == {"one.stopped", "two.stopped"}
@@ -188,10 +188,11 @@ import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from test_queue import Stub
-from torchrl_ocwm.evidence import LAUNCHERS, Machine, work_off
+from torchrl_ocwm.evidence import LAUNCHERS, Machine, queue, work_off
 
 how, root = Machine(workers=1), Path({root!r})
-work_off([Stub(title="long", what="wait")], root, root / "scripts", how, LAUNCHERS["local"](how))
+queue.PROGRAM = "queue_program"
+work_off([Stub(title="long", what="wait")], root, how, LAUNCHERS["local"](how))
 """
 
 
@@ -254,14 +255,14 @@ def test_ray_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.slow
-def test_on_ray(tmp_path: Path, scripts_folder: Path) -> None:
+def test_on_ray(tmp_path: Path) -> None:
     """Two local workers; a failure is told as it is on this machine."""
     pytest.importorskip("ray")
     how = Machine(launcher="ray", workers=2)
     data, bad = Stub(title="data"), Stub(title="bad", what="fail")
     runs = [data, Stub(title="one", after=(data,)), Stub(title="two", after=(data,)), bad]
     with pytest.raises(RunFailedError, match="bad cannot be done"):
-        work_off(runs, tmp_path, scripts_folder, how, LAUNCHERS["ray"](how))
+        work_off(runs, tmp_path, how, LAUNCHERS["ray"](how))
     assert sorted(begun(tmp_path)) == ["bad", "data", "one", "two"]
     assert all(Record.of(run, tmp_path).done for run in runs[:3])
     assert json.loads((tmp_path / runs[1].name / "run.json").read_text())["done"]

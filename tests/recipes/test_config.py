@@ -315,6 +315,12 @@ class TestHydra:
         ]
         assert len({folder for folder, _, _ in seen}) == 4  # each has its own
         assert all("final_lr=0." in folder and agent.world_model for folder, agent, _ in seen)
+        seen.clear()
+        goals = "agent.behaviours.reach.goals={name: mixed, share: 0.3}"
+        command("train_offline", "--multirun", "output=runs", goals, *off)
+        [(folder, _, _)] = seen
+        assert Path(folder).name.startswith("agent.behaviours.reach.goals={name_")  # Windows has no colons in names
+        assert not set(Path(folder).name) & set('<>:"/\\|?*')
 
     def test_keeps_what_it_ran_with(self, tmp_path: Path) -> None:
         keep_settings(Training(updates=3), tmp_path / "run")
@@ -332,7 +338,7 @@ def kinds(base: type = Settings) -> Iterator[type]:
     """All settings classes of the library and of the recipes."""
     for kind in base.__subclasses__():
         yield from kinds(kind)
-        if kind.__module__.split(".")[0] == "torchrl_ocwm" or kind.__module__.startswith("example_"):
+        if kind.__module__.split(".")[0] == "torchrl_ocwm":
             yield kind
 
 

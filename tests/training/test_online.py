@@ -489,7 +489,7 @@ def test_the_recipe_goes_on_after_a_signal(tmp_path: Path, number: signal.Signal
 
 def documented_command() -> list[str]:
     page = (ROOT / "docs" / "howto.md").read_text()
-    found = re.search(r"^python (examples/train_online\.py agent=.*?)\n```", page, re.DOTALL | re.MULTILINE)
+    found = re.search(r"^ocwm (train-online agent=.*?)\n```", page, re.DOTALL | re.MULTILINE)
     assert found is not None
     return shlex.split(found[1].replace("\\\n", ""))
 
@@ -501,7 +501,8 @@ def test_the_documented_command(tmp_path: Path) -> None:
     small += ["training.updates=4", "training.eval_interval=0", "training.video_interval=0", f"output={tmp_path}"]
     small += ["online.seed_steps=[10,10]", "online.seed_updates=2", "online.update_ratio=0.1"]
     small += ["online.round_episodes=1", "online.workers=0"]
-    subprocess.run([sys.executable, *documented_command(), *small], check=True, cwd=ROOT, capture_output=True)
+    command = [sys.executable, "-m", "torchrl_ocwm.console", *documented_command(), *small]
+    subprocess.run(command, check=True, cwd=ROOT, capture_output=True)
     dataset = EpisodeDataset.open(tmp_path / "data", verify=True)
     assert dataset.metadata["policies"] == {"scripted": 1, "random": 1, "reach": 2}
     assert updates(tmp_path) == 4

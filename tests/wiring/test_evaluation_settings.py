@@ -16,6 +16,7 @@ from torchrl_ocwm.agents import build_agent, save_agent
 from torchrl_ocwm.devices import DeviceError
 from torchrl_ocwm.envs import Task, make_task
 from torchrl_ocwm.evaluation import EvaluationEnvs, episodes
+from torchrl_ocwm.recipes import pictures
 from torchrl_ocwm.testing import random_dataset
 
 
@@ -66,9 +67,9 @@ def evaluate(
         with monkeypatch.context() as patch:
             patch.setattr(EvaluationEnvs, "run", note_run)
             patch.setattr(episodes, "make_worker", note_worker)
-            for name in ("heatmap", "learning_curves", "_picture_objects"):
+            for name in ("draw", "picture_episodes"):
                 patch.setattr(module, name, lambda *_, **__: None)
-            patch.setattr(module, "write_video", lambda file, frames: seen["films"].append((Path(file).name, frames)))
+            patch.setattr(pictures, "write_video", lambda file, frames: seen["films"].append((Path(file).name, frames)))
             small = {"goals": 1, "episode_steps": 1, "workers": 0, "video_goals": 0, "random": "false"}
             named = {argument.partition("=")[0] for argument in arguments}
             rest = [f"{name}={value}" for name, value in small.items() if name not in named]

@@ -23,8 +23,7 @@ def reproduce(
     def go(*arguments: str) -> SimpleNamespace:
         seen = SimpleNamespace(runs=[], how=None, launcher=None, root=None, page=None)
 
-        def note(runs: list[Run], root: Path, folder: Path, how: Machine, launcher: Any, **rest: Any) -> None:
-            assert folder == Path(module.__file__ or "").parent
+        def note(runs: list[Run], root: Path, how: Machine, launcher: Any, **rest: Any) -> None:
             seen.__dict__.update(runs=runs, root=root, how=how, launcher=launcher)
 
         def note_page(wanted: Any, found: Any, root: Path) -> Path:

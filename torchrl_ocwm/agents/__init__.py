@@ -6,6 +6,7 @@ from torchrl_ocwm.agents.build import build_agent
 from torchrl_ocwm.agents.checkpoint import collecting_policy, describe, load_agent, save_agent
 from torchrl_ocwm.agents.config import AgentConfig, Behaviour, Learning, Size
 from torchrl_ocwm.agents.explorers import Disagreement, ExplorationReward, ObjectEntropy, StateEntropy
+from torchrl_ocwm.agents.export import export_policy, policy_inputs, policy_outputs
 from torchrl_ocwm.agents.goal_sources import (
     EnvironmentGoals,
     FrameGoalSource,
@@ -84,7 +85,10 @@ __all__ = [
     "build_agent",
     "collecting_policy",
     "describe",
+    "export_policy",
     "load_agent",
+    "policy_inputs",
+    "policy_outputs",
     "register",
     "save_agent",
     "shipped_agents",

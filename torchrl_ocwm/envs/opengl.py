@@ -66,10 +66,15 @@ def _register_exit() -> None:
 def renderer_error(error: BaseException) -> RenderingError:
     """What to install, on one line."""
     reason = " ".join(str(error).split()) or "no details"
+    remedy = (
+        "Install a software renderer: `apt-get install libegl1 libgl1-mesa-dri` for MUJOCO_GL=egl (the default), or "
+        "`apt-get install libosmesa6` for MUJOCO_GL=osmesa."
+        if sys.platform.startswith("linux")
+        else "Leave MUJOCO_GL unset, so that MuJoCo takes this system's own OpenGL."
+    )
+    library = os.environ.get("MUJOCO_GL", "")
     return RenderingError(
-        f"MuJoCo cannot render off screen ({type(error).__name__}: {reason}; MUJOCO_GL="
-        f"{os.environ.get('MUJOCO_GL', '')!r}). Install a software renderer: `apt-get install libegl1 libgl1-mesa-dri`"
-        " for MUJOCO_GL=egl (the default), or `apt-get install libosmesa6` for MUJOCO_GL=osmesa."
+        f"MuJoCo cannot render off screen ({type(error).__name__}: {reason}; MUJOCO_GL={library!r}). {remedy}"
     )
 
 

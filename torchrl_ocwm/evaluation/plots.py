@@ -139,7 +139,7 @@ def read_scalar(folder: Path, metric: str) -> tuple[np.ndarray, np.ndarray] | No
     if not files:
         return None
     values, cut = {}, 0
-    with files[0].open(newline="") as file:
+    with files[0].open(newline="", encoding="utf-8") as file:
         for line in file:
             try:
                 step, value = line.split(",")

@@ -19,6 +19,7 @@ from torchrl_ocwm.evaluation.scores import (
     mean_and_error,
     score_is_undefined,
 )
+from torchrl_ocwm.files import seen_from
 
 #: Metric → column of the table and digits after the point.
 COLUMNS = {
@@ -47,13 +48,13 @@ class Row:
     Args:
         kind: What tells the agent from others of its name, such as its settings in full.
         seeds: What was measured for each seed: metric → ``[N]`` values, one per goal, NaN where it is not defined.
-        sources: Where each seed comes from.
+        sources: Where each seed comes from: a file, or in words.
         runs: What tells one seed from another, whatever its file is called.
     """
 
     kind: str
     seeds: list[dict[str, Tensor]] = field(default_factory=list)
-    sources: list[str] = field(default_factory=list)
+    sources: list[str | Path] = field(default_factory=list)
     runs: list[str] = field(default_factory=list)
 
 
@@ -87,13 +88,13 @@ class Report:
             ReportError: if it is something else.
         """
         try:
-            values = json.loads(Path(file).read_text())
+            values = json.loads(Path(file).read_text(encoding="utf-8"))
             report = cls(torch.tensor(values["goals"]), values["settings"])
             for agent, row in values["agents"].items():
                 runs = row.get("runs", row["sources"])  # older files know runs by their sources only
-                report.rows[agent] = Row(
-                    row.get("kind", agent), [_tensors(seed) for seed in row["per_goal"]], row["sources"], runs
-                )
+                sources = [_source(text, Path(file).parent) for text in row["sources"]]
+                seeds = [_tensors(seed) for seed in row["per_goal"]]
+                report.rows[agent] = Row(row.get("kind", agent), seeds, sources, runs)
         except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
             raise ReportError(f"{file}: not the results.json of an evaluation ({error!r})") from error
         return report
@@ -117,7 +118,7 @@ class Report:
         agent: str,
         metrics: dict[str, Tensor],
         *,
-        source: str,
+        source: str | Path,
         run: str | None = None,
         kind: str | None = None,
     ) -> None:
@@ -128,14 +129,14 @@ class Report:
         Args:
             agent: Its name.
             metrics: Metric → ``[N]`` values, one per goal, NaN where it is not defined.
-            source: Where it comes from, such as the path of a checkpoint.
+            source: Where it comes from: the path of a checkpoint, or words.
             run: What tells it from other seeds, such as the contents of the checkpoint; the source by default.
             kind: What tells the agent from others of its name; nothing by default.
 
         Raises:
             ReportError: if the row has that run already.
         """
-        kind, run = agent if kind is None else kind, source if run is None else run
+        kind, run = agent if kind is None else kind, str(source) if run is None else run
         row = self.rows.setdefault(self._row_name(agent, kind), Row(kind))
         if run in row.runs:
             raise ReportError(
@@ -194,14 +195,14 @@ class Report:
             lines += ["", f"Without a score, as they lie at the start: {at_start} of {len(self.goals)} goals."]
         return "\n".join(lines)
 
-    def to_dict(self) -> dict[str, Any]:
-        """All numbers, ready for JSON."""
+    def to_dict(self, folder: str | Path = ".") -> dict[str, Any]:
+        """All numbers, ready for JSON; paths as seen from a folder."""
         agents: dict[str, Any] = {}
         for agent, row in self.rows.items():
             summaries = {name: self.summary(agent, name) for name in COLUMNS}
             agents[agent] = {
                 "kind": row.kind,
-                "sources": row.sources,
+                "sources": [seen_from(folder, one) if isinstance(one, Path) else one for one in row.sources],
                 "runs": row.runs,
                 "metrics": {
                     name: None if pair is None else {"mean": pair[0], "standard_error": pair[1]}
@@ -218,9 +219,9 @@ class Report:
             OutputError: if they cannot be written; the files of before are then as they were.
         """
         with writing(Path(folder) / "results.json") as file:
-            file.write_text(to_json(self.to_dict()))
+            file.write_text(to_json(self.to_dict(folder)), encoding="utf-8")
         with writing(Path(folder) / "results.md") as file:
-            file.write_text(self.markdown() + "\n")
+            file.write_text(self.markdown() + "\n", encoding="utf-8")
 
 
 def to_json(values: Any) -> str:
@@ -241,6 +242,11 @@ def _plain(values: Any) -> Any:
     if isinstance(values, (list, tuple)):
         return [_plain(value) for value in values]
     return None if isinstance(values, float) and not math.isfinite(values) else values
+
+
+def _source(text: str, folder: Path) -> str | Path:
+    """A path begins with a dot (:func:`~torchrl_ocwm.files.seen_from`); all else, as of older files, is as it is."""
+    return (folder / text).resolve() if text.startswith(".") else text
 
 
 def _tensors(seed: dict[str, list[float | None]]) -> dict[str, Tensor]:

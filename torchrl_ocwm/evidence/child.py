@@ -1,6 +1,6 @@
-"""A script in a process that ends cleanly when the one that started it has ended, however that was.
+"""A module as a program in a process that ends cleanly when the one that started it has ended, however that was.
 
-    python child.py SCRIPT ARGUMENTS...
+    python child.py MODULE ARGUMENTS...
 
 The standard input is a pipe whose other end nobody else holds. It is run by its path, as importing its package would
 cost each process a second.
@@ -16,11 +16,11 @@ from threading import Thread
 
 
 def main() -> None:
-    """Run the script."""
+    """Run the module."""
     Thread(target=_end_with_parent, daemon=True).start()
+    del sys.path[0]  # the folder of this file, whose names are those of other modules too
     del sys.argv[0]
-    sys.path[0] = os.path.dirname(sys.argv[0])
-    runpy.run_path(sys.argv[0], run_name="__main__")
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 
 
 def _end_with_parent() -> None:

@@ -17,7 +17,7 @@ from torchrl_ocwm.evidence.records import Record
 from torchrl_ocwm.evidence.runs import Run, written
 from torchrl_ocwm.evidence.settings import Evidence
 
-IMAGE_GOALS = ", image goals"  # as evaluate.py names rows
+IMAGE_GOALS = ", image goals"  # as ``ocwm evaluate`` names rows
 CURVE = {"evaluation/final_score": "final score, landmark goals"}
 
 
@@ -50,7 +50,7 @@ def write_page(wanted: Evidence, results: Sequence[Result], root: Path) -> Path:
     parts += ["## How it was made", _command(wanted), *_making(runs, records)]
     page = folder / "README.md"
     with writing(page) as file:
-        file.write_text("\n\n".join(parts) + "\n")
+        file.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return page
 
 
@@ -130,7 +130,7 @@ def _lines(figure: Figure, done: Sequence[Result], report: Report) -> dict:
 def _command(wanted: Evidence) -> str:
     values = {one.name: getattr(wanted, one.name) for one in fields(Evidence)}
     settings = [f"{name}={written(value)}" for name, value in values.items() if value is not None]
-    return f"```bash\npython examples/reproduce.py {' '.join(settings)}\n```"
+    return f"```bash\nocwm reproduce {' '.join(settings)}\n```"
 
 
 def _making(runs: Sequence[Run], records: dict[str, Record]) -> list[str]:

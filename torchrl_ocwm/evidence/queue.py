@@ -18,7 +18,7 @@ from torchrl_ocwm.evidence.records import LOG, Record, commit, machine
 from torchrl_ocwm.evidence.runs import Command, Run
 from torchrl_ocwm.evidence.settings import Machine
 
-CHILD = Path(__file__).with_name("child.py")
+CHILD, PROGRAM = Path(__file__).with_name("child.py"), "torchrl_ocwm.console"
 _LOOK, _NOTE = 0.2, 30.0  # seconds between two looks at a process, and between two notes of the time
 _PATIENCE = 120.0  # seconds that a process has to end when told to
 
@@ -36,16 +36,16 @@ class Job:
         root: Folder of all runs.
         commands: What does it.
         record: What is known of it so far.
-        scripts: Folder of the scripts.
         threads: Threads of each process.
+        program: The module that does a command.
     """
 
     run: Run
     root: Path
     commands: Sequence[Command]
     record: Record
-    scripts: Path
     threads: int
+    program: str
 
     @property
     def folder(self) -> Path:
@@ -65,7 +65,6 @@ def in_order(runs: Iterable[Run]) -> list[Run]:
 def work_off(
     runs: Sequence[Run],
     root: Path,
-    scripts: Path,
     how: Machine,
     launcher: Launcher,
     *,
@@ -79,7 +78,6 @@ def work_off(
     Args:
         runs: The runs, what is needed first (:func:`in_order`).
         root: Folder of all runs.
-        scripts: Folder of the scripts that do them.
         how: How.
         launcher: Where.
         on_done: Called after each run.
@@ -96,7 +94,7 @@ def work_off(
             while len(at_work) < launcher.slots and (run := _next(left, done)):
                 left.remove(run)
                 commands = run.commands(root, how)
-                job = Job(run, root, commands, records[run.name], scripts, how.threads)
+                job = Job(run, root, commands, records[run.name], how.threads, PROGRAM)
                 at_work[launcher.submit(perform, job)] = run
             if not at_work:
                 break
@@ -130,7 +128,7 @@ def perform(job: Job, stop: Event, environment: Mapping[str, str]) -> None:
         RunFailedError: if a command fails or is stopped, or ends before all is done.
     """
     job.folder.mkdir(parents=True, exist_ok=True)
-    record = replace(job.record, commands=tuple(job.commands), commit=commit(job.scripts), machine=machine())
+    record = replace(job.record, commands=tuple(job.commands), commit=commit(), machine=machine())
     before, start = record.seconds, time.monotonic()
 
     def note(done: bool = False) -> None:
@@ -147,14 +145,13 @@ def perform(job: Job, stop: Event, environment: Mapping[str, str]) -> None:
 
 
 def _run(job: Job, command: Command, stop: Event, environment: Mapping[str, str], note: Callable[[], None]) -> None:
-    script, *arguments = command
     threads = str(job.threads)
     variables = {**os.environ, "OMP_NUM_THREADS": threads, "LP_NUM_THREADS": "0", **environment}
     with (job.folder / LOG).open("ab") as log:
-        log.write(f"\n$ python examples/{' '.join(command)}\n".encode())
+        log.write(f"\n$ ocwm {' '.join(command)}\n".encode())
         log.flush()
         process = subprocess.Popen(
-            [sys.executable, str(CHILD), str(job.scripts / script), *arguments],
+            [sys.executable, str(CHILD), job.program, *command],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,
@@ -200,5 +197,5 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _last_line(file: Path) -> str:
-    lines = file.read_text(errors="replace").strip().splitlines()
+    lines = file.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return lines[-1].rpartition("\r")[2] if lines else "it has said nothing"

@@ -77,7 +77,7 @@ class Record:
             RecordError: if it is none.
         """
         try:
-            return cls(**json.loads(file.read_text()))
+            return cls(**json.loads(file.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError) as error:
             raise RecordError(f"{file}: not the record of a run ({error}); move the folder away") from error
 
@@ -88,7 +88,7 @@ class Record:
             OutputError: if it cannot be written.
         """
         with writing(folder / RECORD) as file:
-            file.write_text(json.dumps(asdict(self), indent=1) + "\n")
+            file.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
 
 
 def machine() -> str:
@@ -103,17 +103,20 @@ def machine() -> str:
 
 def _processor() -> str:
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:  # not Linux
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def commit(folder: Path) -> str:
-    """The commit of a checkout, with a plus if it has been changed; the release of what is no checkout."""
+def commit() -> str:
+    """The commit of the checkout that this package is in, with a plus if it has been changed; else its release."""
+    checkout = Path(__file__).parents[2]
     try:
-        git = ["git", "-C", str(folder), "describe", "--always", "--abbrev=8", "--exclude=*", "--dirty=+"]
+        if not (checkout / ".git").exists():  # an installed one may lie in a checkout of something else
+            return version("torchrl-ocwm")
+        git = ["git", "-C", str(checkout), "describe", "--always", "--abbrev=8", "--exclude=*", "--dirty=+"]
         return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return version("torchrl-ocwm")

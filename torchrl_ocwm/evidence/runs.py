@@ -18,7 +18,7 @@ from torchrl_ocwm.evidence.settings import Machine
 from torchrl_ocwm.settings import Settings, change, from_dict
 from torchrl_ocwm.training import CHECKPOINT, Online, Training
 
-#: A script of ``examples/`` and its arguments.
+#: What follows ``ocwm`` on a command line.
 Command = tuple[str, ...]
 #: Episodes of each evaluation during training, to as many of the landmark goals.
 LANDMARKS = 5
@@ -121,12 +121,12 @@ class Collected(Run):
         return f"collect {self.env} {image_size(self.env, self.options)}"
 
     def commands(self, root: Path, machine: Machine) -> list[Command]:  # noqa: ARG002
-        """``collect.py``, once for each policy."""
+        """``ocwm collect``, once for each policy."""
         shared = [f"env={self.env}", *given("env.options", self.options), f"seed={self.seed}", "workers=0"]
         path, done, commands = override("dataset", self.dataset(root)), 0, []
         for policy, steps in self.policies.items():
             done += steps
-            commands.append(("collect.py", *shared, f"policy={policy}", f"steps={done}", path))
+            commands.append(("collect", *shared, f"policy={policy}", f"steps={done}", path))
         return commands
 
     def dataset(self, root: Path) -> Path:
@@ -199,7 +199,7 @@ class Explored(Run):
         return Online(steps=self.steps, seed_steps=(seeded,), seed_updates=first, update_ratio=UPDATE_RATIO, workers=0)
 
     def commands(self, root: Path, machine: Machine) -> list[Command]:
-        """``train_online.py``."""
+        """``ocwm train-online``."""
         online = self._online
         settings = {
             "steps": online.steps,
@@ -211,7 +211,7 @@ class Explored(Run):
         training = {"seed": self.seed, "updates": self.updates, "eval_interval": 0, "video_interval": 0}
         return [
             (
-                "train_online.py",
+                "train-online",
                 *(f"agent={self.explorer}", f"env={self.env}", f"size={self.size}"),
                 *given("env.options", self.options),
                 *given("online", settings),
@@ -294,7 +294,7 @@ class Trained(Run):
         return (self.data,)
 
     def commands(self, root: Path, machine: Machine) -> list[Command]:
-        """``train_offline.py``."""
+        """``ocwm train``."""
         evaluation = {
             "eval_interval": self._eval_interval,
             "eval_episodes": LANDMARKS,
@@ -305,7 +305,7 @@ class Trained(Run):
         settings = {**learning, **evaluation, "threads": machine.threads, "device": machine.device}
         return [
             (
-                "train_offline.py",
+                "train",
                 *(f"agent={self.agent}", f"env={self.data.env}", f"size={self.size}"),
                 *given("agent", self.changes),
                 *given("training", settings),
@@ -376,11 +376,11 @@ class Evaluated(Run):
         return (self.trained,)
 
     def commands(self, root: Path, machine: Machine) -> list[Command]:  # noqa: ARG002
-        """``evaluate.py``."""
+        """``ocwm evaluate``."""
         settings = [f"{name}={written(value)}" for name, value in self._settings.items()]
         checkpoint = override("checkpoint", root / self.trained.name / CHECKPOINT)
         output = override("output", root / self.name)
-        return [("evaluate.py", checkpoint, output, *settings, "workers=0", "envs=10", "video_goals=0")]
+        return [("evaluate", checkpoint, output, *settings, "workers=0", "envs=10", "video_goals=0")]
 
     def reached(self, root: Path) -> int:
         """All or nothing: an evaluation begins anew."""

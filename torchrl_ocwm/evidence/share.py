@@ -41,9 +41,10 @@ def share(evaluation: Path, folder: Path, *, name: str | None = None) -> Path:
     training = _training(evaluation, record)
     agent = load_agent(training / CHECKPOINT).agent
     report = Report.load(evaluation / "results.json")
+    card = _card(name or str(folder), agent, record, Record.read(training / RECORD), report)
     save_agent(agent, folder / AGENT_FILE)
     with writing(folder / CARD) as file:
-        file.write_text(_card(name or str(folder), agent, record, Record.read(training / RECORD), report))
+        file.write_text(card, encoding="utf-8")
     return folder
 
 

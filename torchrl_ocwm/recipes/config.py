@@ -10,35 +10,40 @@ from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-import hydra
-from hydra.core.config_store import ConfigStore
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_ocwm.agents import AGENTS, EXPLORERS, SIZES
 from torchrl_ocwm.agents.config import EXPLORE
+from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
+from torchrl_ocwm.files import as_file_name, seen_from
 from torchrl_ocwm.parts import Part, load_plugins
 from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
+
+with needs("a recipe", "recipes"):
+    import hydra
+    from hydra.core.config_store import ConfigStore
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+    from omegaconf import DictConfig, OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
 
 T = TypeVar("T")
 #: All groups of options that there are.
 GROUPS = {"agent", "explore", "size", "env"}
+_PATHS = ("checkpoint", "dataset", "output")
 _QUIET = ("job_logging", "hydra_logging")
 
 
 def recipe(
     name: str, groups: Mapping[str, str] | None = None, **more: Any
 ) -> Callable[[Callable[[T], None]], Callable[[], None]]:
-    """Make a function of settings the main function of a script that is configured with Hydra.
+    """Make a function of settings the main function of a program that is configured with Hydra.
 
-    The argument of the function is annotated with its settings class. Errors that a user can mend end the script with
-    one line; all others show their traceback (``HYDRA_FULL_ERROR=1`` shows it for all).
+    The argument of the function is annotated with its settings class. Errors that a user can mend end it with one line;
+    all others show their traceback (``HYDRA_FULL_ERROR=1`` shows it for all).
 
     Args:
         name: Name of the recipe.
@@ -103,13 +108,20 @@ def _check_choices(groups: Iterable[str], arguments: Iterable[str]) -> None:
 
 
 def keep_settings(settings: Any, folder: Path) -> None:
-    """Keep the settings of a run in its folder, as ``config.yaml``.
+    """Keep the settings of a run in its folder, as ``config.yaml``, with paths as seen from there.
 
     Raises:
         OutputError: if it cannot be written.
     """
     with writing(folder / "config.yaml") as new:
-        OmegaConf.save(OmegaConf.create(to_dict(settings)), new)
+        OmegaConf.save(OmegaConf.create(kept(settings, folder)), new)
+
+
+def kept(settings: Any, folder: Path) -> dict[str, Any]:
+    """Settings for a file in a folder to hold: paths of what is there are as seen from that folder."""
+    plain = to_dict(settings)
+    there = [name for name in _PATHS if plain.get(name) is not None and Path(plain[name]).exists()]
+    return {**plain, **{name: seen_from(folder, plain[name]) for name in there}}
 
 
 def run_folder(output: str) -> Path:
@@ -117,9 +129,9 @@ def run_folder(output: str) -> Path:
     hydra_config = HydraConfig.get()
     if hydra_config.mode is not RunMode.MULTIRUN:
         return Path(output)
-    given = {item.lstrip("+").partition("=")[0]: item.replace("/", "_") for item in hydra_config.overrides.task}
+    given = {item.lstrip("+").partition("=")[0]: item for item in hydra_config.overrides.task}
     shown = {"output"} if "output" in given else {"agent", "env", "size", "training.seed"}
-    return Path(output, ",".join(item for key, item in given.items() if key not in shown))
+    return Path(output, as_file_name(",".join(item for key, item in given.items() if key not in shown)))
 
 
 def help_lines(kind: type, at: str = "") -> Iterator[str]:

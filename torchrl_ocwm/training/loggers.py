@@ -109,11 +109,11 @@ def make_loggers(folder: Path, also: tuple[str, ...] = (), *, name: str = "run")
 
 
 def _cut(file: Path, step: int) -> None:
-    rows = file.read_text().splitlines(keepends=True)
+    rows = file.read_text(encoding="utf-8").splitlines(keepends=True)
     kept = [row for row in rows if row.endswith("\n") and _step(row) <= step]
     if kept != rows:
         with replacing(file) as new:
-            new.write_text("".join(kept))
+            new.write_text("".join(kept), encoding="utf-8")
 
 
 def _step(row: str) -> float:

@@ -1,0 +1,102 @@
+"""Look into a world model: ``ocwm diagnose checkpoint=.../checkpoint.zip dataset=data/reacher``.
+
+How well it sees and imagines masks and positions of the objects, and whether goal latents match what they stand for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_ocwm import load_agent
+from torchrl_ocwm.agents import Agent
+from torchrl_ocwm.data import DatasetError, EpisodeDataset
+from torchrl_ocwm.envs import Task
+from torchrl_ocwm.evaluation import (
+    Diagnosis,
+    check_ffmpeg,
+    draw_errors,
+    draw_goal_latents,
+    latent_pairs,
+    match,
+    object_errors,
+    picture_objects,
+    random_sequences,
+    to_json,
+    writing,
+)
+from torchrl_ocwm.modules import ObjectWorldModel
+from torchrl_ocwm.recipes.config import kept, recipe
+from torchrl_ocwm.recipes.diagnosis_tables import error_table, goal_table
+from torchrl_ocwm.signals import ended_by_signals
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnose(Diagnosis):
+    """Settings of the recipe.
+
+    Args:
+        checkpoint: Checkpoint of the agent whose world model is examined.
+        dataset: Folder of a dataset of the same task.
+        output: Folder for table, numbers, pictures and video.
+    """
+
+    checkpoint: str
+    dataset: str
+    output: str = "outputs/diagnosis"
+
+
+@recipe("diagnose")
+@ended_by_signals()
+def main(config: Diagnose) -> None:
+    """Measure, draw, and write it all down."""
+    settings, output = config, Path(config.output)
+    if settings.video_sequences:
+        check_ffmpeg("video_sequences")
+    agent = load_agent(config.checkpoint, device=settings.device).agent
+    records = _records(Path(config.dataset), config.checkpoint, agent.task, settings)
+    torch.manual_seed(settings.seed)
+    errors, goals = _errors(agent, records, settings, output), _goals(agent, records, settings, output)
+    table = "\n\n".join(part for part in (error_table(errors, agent.task.objects), goal_table(goals)) if part)
+    numbers = {"objects": agent.task.objects, "errors": errors, "goal_latents": goals}
+    with writing(output / "diagnosis.json") as file:
+        file.write_text(to_json({"settings": kept(config, output), **numbers}), encoding="utf-8")
+    with writing(output / "diagnosis.md") as file:
+        file.write_text(table + "\n", encoding="utf-8")
+    print(table)
+    print(f"\ntable, numbers, pictures: {output}")
+
+
+def _records(path: Path, checkpoint: str, task: Task, settings: Diagnosis) -> TensorDictBase:
+    dataset = EpisodeDataset.open(path)
+    there = dataset.task
+    if there != task:
+        raise DatasetError(f"{dataset.path}: holds {there}, but the agent in {checkpoint} is of {task}")
+    records = random_sequences(dataset, settings.sequences, settings.length, seed=settings.seed)
+    return records.to(settings.device)
+
+
+def _errors(agent: Agent, records: TensorDictBase, settings: Diagnosis, output: Path) -> dict[str, dict[str, Tensor]]:
+    """Masks and positions; the pictures of each object, if the world model has any."""
+    model, names = agent.model, agent.task.objects
+    errors = object_errors(model, records, settings.context)
+    if errors["imagined"]:
+        draw_errors(output / "errors.png", errors, names)
+    if isinstance(model, ObjectWorldModel) and settings.video_sequences:
+        picture_objects(output, model, records[: settings.video_sequences], settings.context, names)
+    return errors
+
+
+def _goals(agent: Agent, records: TensorDictBase, settings: Diagnosis, output: Path) -> dict[str, dict[str, float]]:
+    """Goal latents of the object that is to be positioned, if the agent has such."""
+    model = agent.model
+    if not isinstance(model, ObjectWorldModel) or model.positional_encoder is None:
+        return {}
+    index = agent.policy().object_index
+    pairs, positions = latent_pairs(model, records, frames=settings.frames, object_index=index, seed=settings.seed)
+    draw_goal_latents(output / "goal_latents.png", pairs, positions)
+    return {name: match(*pair, positions) for name, pair in pairs.items()}
