@@ -145,7 +145,7 @@ def make_env(
         seed: Seeds the environments, each differently.
         device: Where observations are put.
         options: Passed to the environment: image_size, horizon, action_repeat, mask_scale, virtual_target,
-            camera_options, privileged.
+            labelled_frames, camera_options, privileged.
 
     Returns:
         An environment with the keys of the data contract (docs/data.md) and ``is_init``. The goal of an episode can be
