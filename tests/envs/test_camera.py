@@ -106,7 +106,7 @@ def test_depth_only_when_asked_for(open_camera, data):
 
 def test_frames_are_copies(open_camera, model, data):
     camera = open_camera()
-    before = camera.render(data, depth=True)
+    before = camera.render(data, depth=True, fine_pixels=True)
     kept = [part.copy() for part in before]
     moved = mujoco.MjData(model)
     moved.geom_xpos[:] = data.geom_xpos[::-1]
@@ -269,3 +269,13 @@ def test_closing_a_camera_leaves_the_others_alone(open_camera, model, data):
     after = first.render(data, depth=True)
     for old, new in zip(before, after, strict=True):
         assert np.array_equal(old, new)
+
+
+def test_fine_pixels_are_those_of_a_larger_camera(open_camera, data):
+    frame = open_camera(mask_scale=3).render(data, depth=True, fine_pixels=True)
+    large = open_camera(height=3 * HEIGHT, width=3 * WIDTH).render(data, depth=True)
+    assert np.array_equal(frame.fine_pixels, large.pixels)
+    assert np.array_equal(frame.geoms, large.geoms)
+    assert np.array_equal(frame.depth, large.depth)
+    assert np.array_equal(frame.pixels, open_camera().render(data).pixels)
+    assert open_camera().render(data).fine_pixels is None

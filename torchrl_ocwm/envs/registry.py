@@ -189,8 +189,22 @@ def make_task(name: str, **options: Any) -> Task:
             proprio=space["proprio"].shape[0],
             action=scene.action_space.shape[0],
             workspace=scene.workspace,
-            options={key: value for key, value in options.items() if key not in ("horizon", "privileged")},
+            options={key: value for key, value in recorded(options).items() if key not in ("horizon", "privileged")},
         )
+
+
+#: Options that earlier releases did not have, with what these did.
+_LATER = {"labelled_frames": 0}
+
+
+def recorded(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options as datasets and tasks keep them, so that those of earlier releases stay equal to new ones.
+
+    Examples:
+        >>> recorded({"image_size": 64, "labelled_frames": 0})
+        {'image_size': 64}
+    """
+    return {name: value for name, value in options.items() if name not in _LATER or value != _LATER[name]}
 
 
 def make_scene(environment: Environment, **options: Any) -> Any:
