@@ -212,8 +212,14 @@ def test_clicks_beside_the_image_and_of_other_shapes_are_refused() -> None:
     pixels = picture({})[None]
     with pytest.raises(ValueError, match=r"the click \(24, 3\) is beside the image, which is 24 x 24"):
         ColourMasks.from_clicks(pixels, torch.tensor([[[[24.0, 3.0]]]]))
-    with pytest.raises(ValueError, match=r"1 frames need points \[F, O, N, 2\], got \(1, 1, 2\)"):
+    with pytest.raises(ValueError, match=r"points \[F, O, N, 2\], got \(1, 3, 24, 24\) and \(1, 1, 2\)"):
         ColourMasks.from_clicks(pixels, torch.tensor([[[3.0, 3.0]]]))
+
+
+def test_objects_without_a_click_are_named() -> None:
+    points = torch.tensor([[[[4.0, 3.0]], [[torch.nan, torch.nan]]]])
+    with pytest.raises(ValueError, match=r"objects \[1\] have no click in any frame"):
+        ColourMasks.from_clicks(picture({})[None], points)
 
 
 def test_missing_images_are_named() -> None:

@@ -26,6 +26,7 @@ from torchrl_ocwm.envs.registry import (
     make_task,
     register_environment,
 )
+from torchrl_ocwm.envs.sam2_masks import SAM2Masks
 from torchrl_ocwm.envs.scripted import ScriptedAction
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.envs.workspace import Workspace
@@ -55,6 +56,7 @@ __all__ = [
     "PickPlace",
     "PositioningEnv",
     "Reacher",
+    "SAM2Masks",
     "ScriptedAction",
     "ShelfPlace",
     "SimulationDivergedError",

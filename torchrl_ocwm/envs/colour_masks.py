@@ -7,14 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import conv3d, pad
-from torchrl.data import Binary, Composite
-from torchrl.envs import Transform
 
-from torchrl_ocwm.envs.keys import read
+from torchrl_ocwm.envs.masks import ToMasks, check_clicks, check_images
 from torchrl_ocwm.envs.missing import needs
 
 _LEVELS = 32  # of red, green and blue each
@@ -22,7 +19,7 @@ _UNSEEN = 0.02  # pixels; a colour more than a level away from all labelled ones
 _POOR = 0.5
 
 
-class ColourMasks(Transform):
+class ColourMasks(ToMasks):
     """Find objects by their colours, without a simulator or a network: ``pixels`` → ``masks``, ``object_visible``.
 
     Stands before :class:`~torchrl_ocwm.envs.MaskToPosition` in an environment, a replay buffer, or over a dataset
@@ -66,7 +63,7 @@ class ColourMasks(Transform):
         masks: NestedKey = "masks",
         object_visible: NestedKey = "object_visible",
     ) -> None:
-        super().__init__(in_keys=[pixels], out_keys=[masks, object_visible])
+        super().__init__(objects, pixels=pixels, masks=masks, object_visible=object_visible)
         self.smallest = smallest
         #: ``[O, 32 * 32 * 32]``: of the labelled pixels of a colour, the share that is the object's.
         self.register_buffer("share", torch.zeros(objects, _LEVELS**3))
@@ -83,7 +80,7 @@ class ColourMasks(Transform):
         Raises:
             ValueError: for other shapes or dtypes, or an object without a labelled pixel.
         """
-        _check_images(pixels)
+        check_images(pixels)
         if masks.dtype != torch.bool or masks.ndim != 4 or masks[:, 0].shape != pixels[:, 0].shape:
             raise ValueError(
                 f"pixels {(*pixels.shape,)} need masks [F, O, H, W] of bool, got {masks.dtype} {(*masks.shape,)}"
@@ -119,9 +116,8 @@ class ColourMasks(Transform):
             >>> int(transform.segment(pixels).sum())
             6
         """
-        _check_images(pixels)
-        if points.ndim != 4 or len(points) != len(pixels) or points.shape[-1] != 2:
-            raise ValueError(f"{len(pixels)} frames need points [F, O, N, 2], got {(*points.shape,)}")
+        check_images(pixels)
+        check_clicks(pixels, points)
         masks = torch.stack(
             [
                 torch.stack([_around(image, clicks, tolerance) for clicks in objects])
@@ -143,27 +139,9 @@ class ColourMasks(Transform):
 
     def segment(self, pixels: Tensor) -> Tensor:
         """Masks ``[..., O, H, W]`` bool of images ``[..., 3, H, W]`` uint8."""
-        _check_images(pixels)
+        check_images(pixels)
         sure = self.share[:, _colours(pixels)] > 0.5  # of two objects, at most one
         return largest_component(sure.movedim(0, -3), self.smallest)
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        masks = self.segment(read(self, next_tensordict, self.in_keys[0]))
-        next_tensordict.set(self.out_keys[0], masks)
-        return next_tensordict.set(self.out_keys[1], masks.flatten(-2).any(-1))
-
-    forward = _call
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
-        return self._call(tensordict_reset)
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the masks, and whether objects are visible, to the observations."""
-        *batch, _, height, width = observation_spec[self.in_keys[0]].shape
-        shape, device = (*batch, len(self.share)), observation_spec.device
-        observation_spec[self.out_keys[0]] = Binary(shape=(*shape, height, width), dtype=torch.bool, device=device)
-        observation_spec[self.out_keys[1]] = Binary(shape=shape, dtype=torch.bool, device=device)
-        return observation_spec
 
 
 def largest_component(masks: Tensor, smallest: int = 1) -> Tensor:
@@ -196,11 +174,6 @@ def largest_component(masks: Tensor, smallest: int = 1) -> Tensor:
     return torch.from_numpy(kept).reshape(-1, height + 1, width)[:, :-1].reshape(masks.shape).to(masks.device)
 
 
-def _check_images(pixels: Tensor) -> None:
-    if pixels.dtype != torch.uint8 or pixels.ndim < 3 or pixels.shape[-3] != 3:
-        raise ValueError(f"ColourMasks needs images [..., 3, H, W] of uint8, got {pixels.dtype} {(*pixels.shape,)}")
-
-
 def _colours(pixels: Tensor) -> Tensor:
     """Number of each pixel's colour, ``[..., 3, H, W]`` → ``[..., H, W]``."""
     red, green, blue = (pixels.long() * _LEVELS // 256).unbind(-3)
@@ -225,8 +198,6 @@ def _around(image: Tensor, clicks: Tensor, tolerance: int) -> Tensor:
     picture = np.ascontiguousarray(image.movedim(0, -1).cpu().numpy())
     how = 4 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE
     for column, row in clicks[clicks.isfinite().all(-1)].tolist():
-        if not (0 <= column < width and 0 <= row < height):
-            raise ValueError(f"the click ({column:g}, {row:g}) is beside the image, which is {width} x {height}")
         near = (tolerance,) * 3
         cv2.floodFill(picture, mask, (int(column), int(row)), (0,), near, near, how)
     return torch.from_numpy(mask[1:-1, 1:-1] > 0).to(image.device)
