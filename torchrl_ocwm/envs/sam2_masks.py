@@ -24,7 +24,7 @@ class SAM2Masks(ToMasks):
     """Find objects with SAM 2's video predictor: ``pixels`` → ``masks``, ``object_visible``.
 
     Stands before :class:`~torchrl_ocwm.envs.MaskToPosition`, as :class:`~torchrl_ocwm.envs.ColourMasks` does, where
-    colours are not enough. You bring the weights, and click on the objects in one or a few frames. These prompts are put
+    colours are not enough. You bring the weights, and click on the objects in one or a few frames. These are put
     before each sequence, as the beginning of its video, and the predictor tracks the objects from there. So they are
     enough for a whole dataset (:func:`~torchrl_ocwm.data.transform_dataset`).
 
