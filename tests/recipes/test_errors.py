@@ -119,8 +119,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         ),
         (
             "train_offline",
-            "dataset={small} size.architecture.cnn_mults=[1,1,1,1,1,1]",
-            "SettingsError: a CNN of 6 stages halves the image 6 times, which an image of 32 x 32 pixels",
+            "dataset={small} size.architecture.style=dreamer_v2",
+            "SettingsError: the CNN of style 'dreamer_v2' takes images of 64 x 64 pixels, got 32 x 32",
         ),
         (
             "train_offline",

@@ -17,6 +17,7 @@ from torchrl_ocwm.agents.goal_sources import (
 from torchrl_ocwm.agents.goals import FullLatent, Goal, GoalEncoding, ImageEmbedding, NoGoal, ObjectLatent, Position
 from torchrl_ocwm.agents.optimizers import Adam, DreamerV3, OptimizerPart
 from torchrl_ocwm.agents.presets import AGENTS, EXPLORERS, SIZES, agent_name
+from torchrl_ocwm.agents.requirements import lacking, remedies, ruled_out
 from torchrl_ocwm.agents.rewards import (
     FullLatentCosine,
     ImaginedReward,
@@ -80,7 +81,10 @@ __all__ = [
     "build_agent",
     "collecting_policy",
     "describe",
+    "lacking",
     "load_agent",
     "register",
+    "remedies",
+    "ruled_out",
     "save_agent",
 ]
