@@ -166,10 +166,10 @@ class Recordings:
         actions = [join_vectors(self._read(number, "action")["action"]) for number in range(len(self))]
         discrete = not actions[0].is_floating_point() and actions[0].shape[-1] == 1
         every = torch.cat(actions)
-        pixels = self._images(first)
+        height, width = self._images(first).shape[-2:]
         return Task(
             name=settings.name,
-            image_size=(pixels.shape[-2], pixels.shape[-1]),
+            image_size=height if height == width else (height, width),
             objects=settings.objects,
             proprio=join_vectors(first["proprio"]).shape[-1],
             action=(settings.actions or int(every.max()) + 1) if discrete else every.shape[-1],
@@ -199,8 +199,8 @@ class Recordings:
     # What belongs to frames.
 
     def _frames(self, arrays: Mapping[str, list[np.ndarray]], task: Task) -> dict[str, Tensor]:
-        frames = {"pixels": self._images(arrays), "proprio": join_vectors(arrays["proprio"]).float()}
         objects = len(task.objects)
+        frames = {"pixels": self._images(arrays), "proprio": join_vectors(arrays["proprio"]).float()}
         if self.names["masks"]:
             frames["masks"] = masks(arrays["masks"], objects, self._first_camera(arrays), task.image_shape)
         if self.names["object_position"]:
@@ -213,6 +213,9 @@ class Recordings:
             frames["object_visible"] = visible
         if self.names["goal_position"]:
             frames["goal_position"] = self._metres(join_vectors(arrays["goal_position"]), 1).squeeze(-2)
+        if len({len(values) for values in frames.values()}) > 1:
+            rows = ", ".join(f"{len(values)} of {name}" for name, values in frames.items())
+            raise SourceError(f"{self.source.path}: every frame needs all of {', '.join(frames)}; there are {rows}")
         return frames
 
     def _images(self, arrays: Mapping[str, list[np.ndarray]]) -> Tensor:

@@ -91,6 +91,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     #: How far the middle of an object lies behind its visible surface, metres along the optical axis.
     depth_offset: ClassVar[float] = 0.0
     blind: bool = False
+    _made_with: partial[PositioningEnv]
 
     def __init__(
         self,

@@ -1,4 +1,6 @@
-"""Make a dataset of recordings of others: ``ocwm import source=demos.hdf5 name=my_arm keys.pixels=obs.agentview_image``.
+"""Make a dataset of recordings of others.
+
+``ocwm import source=demos.hdf5 name=my_arm keys.pixels=obs.agentview_image keys.proprio=obs.robot0_joint_pos``
 
 The mapping of keys can be kept in a file: ``ocwm import --config-dir . +robot=my_arm source=...`` reads
 ``robot/my_arm.yaml``, which begins with the line ``# @package _global_``.

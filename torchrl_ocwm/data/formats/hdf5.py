@@ -58,7 +58,11 @@ class HDF5Source(Source):
         return read
 
     def _arrays(self, episode: int) -> dict[str, Any]:
-        return {name: array for name, array in flat(self.file[self.episodes[episode]]) if array.ndim}
+        return {name: array for name, array in flat(self.file[self.episodes[episode]]) if _is_array(array)}
+
+
+def _is_array(item: Any) -> bool:
+    return bool(item.ndim) and item.dtype.kind in "biuf"
 
 
 def _is_episode(item: Any) -> bool:

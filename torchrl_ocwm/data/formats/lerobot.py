@@ -51,12 +51,6 @@ class LeRobotSource(Source):
         """Names of the features, each with the shape of a row."""
         return {name: tuple(feature["shape"]) for name, feature in self.info["features"].items()}
 
-    def find(self, key: str) -> str | None:
-        """As for all, and the camera, if there is one only."""
-        cameras = [name for name, one in self.info["features"].items() if one["dtype"] in ("image", "video")]
-        found = super().find(key)
-        return cameras[0] if found is None and key == "pixels" and len(cameras) == 1 else found
-
     def read(self, episode: int, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Arrays of an episode."""
         for name in names:

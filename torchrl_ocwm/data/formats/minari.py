@@ -55,6 +55,11 @@ class MinariSource(Source):
         return {name: arrays[name] for name in names}
 
     def _arrays(self, episode: int) -> dict[str, np.ndarray]:
-        data = self.dataset[int(self.dataset.episode_indices[episode])]
+        data = self.dataset[episode]
         leaves = flat({part: getattr(data, part) for part in _PARTS})
-        return {name: array for name, array in leaves if isinstance(array, np.ndarray) and array.ndim}
+        return {name: array for name, array in leaves if _is_read(array)}
+
+
+def _is_read(array: Any) -> bool:
+    """Not the texts, and not the images of less than 32 pixels, which Minari compresses but does not decompress."""
+    return isinstance(array, np.ndarray) and array.ndim > 0 and array.dtype.kind in "biuf"

@@ -33,17 +33,18 @@ class NpzSource(Source):
         """Names of the arrays of the first episode, each with the shape of a row."""
         with self._open(0) as arrays:
             shapes = {name: arrays[name].shape[1:] for name in arrays.files if arrays[name].ndim}
-        return shapes if self._video(0) is None else {**shapes, VIDEO: video_shape(self._video(0))}
+        video = self._video(0)
+        return shapes if video is None else {**shapes, VIDEO: video_shape(video)}
 
     def read(self, episode: int, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Arrays of an episode."""
-        read = {}
+        read, video = {}, self._video(episode)
         with self._open(episode) as arrays:
             for name in names:
                 if name in arrays.files:
                     read[name] = arrays[name]
-                elif name == VIDEO and self._video(episode) is not None:
-                    read[name] = read_video(self._video(episode))
+                elif name == VIDEO and video is not None:
+                    read[name] = read_video(video)
                 else:
                     raise self.lacks(episode, name)
         return read

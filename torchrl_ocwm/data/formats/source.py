@@ -60,11 +60,13 @@ class Source(ABC):
         """
 
     def find(self, key: str) -> str | None:
-        """The array that goes by the format's usual name for a key, or is the only one that ends with the key."""
+        """The array that goes by the format's usual name for a key, or ends with the key, or is the only camera."""
         shapes = self.shapes()
         if self.usual.get(key) in shapes:
             return self.usual[key]
         found = [name for name in shapes if name.rpartition(".")[2] == key]
+        if not found and key == "pixels":
+            found = [name for name, shape in shapes.items() if len(shape) == 3 and 3 in (shape[0], shape[-1])]
         return found[0] if len(found) == 1 else None
 
     def lacks(self, episode: int, name: str) -> SourceError:
