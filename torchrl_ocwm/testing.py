@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict
+from torch.nn.functional import one_hot
 
 from torchrl_ocwm.data.dataset import EpisodeDataset
 from torchrl_ocwm.envs.task import Task
@@ -37,6 +38,9 @@ def random_records(task: Task, batch: int, time: int, *, seed: int = 0) -> Tenso
     def uniform(*features: int) -> torch.Tensor:
         return torch.rand(*shape, *features, generator=generator)
 
+    action = 2 * uniform(task.action) - 1
+    if task.discrete:
+        action = one_hot(action.argmax(-1), task.action).float()
     is_init = torch.zeros(*shape, 1, dtype=torch.bool)
     is_init[:, 0] = True
     position = torch.stack([task.workspace.sample(shape, generator) for _ in range(objects)], -2)
@@ -44,7 +48,7 @@ def random_records(task: Task, batch: int, time: int, *, seed: int = 0) -> Tenso
     done = torch.zeros(*shape, 1, dtype=torch.bool)
     return TensorDict(
         {
-            "action": 2 * uniform(task.action) - 1,
+            "action": action,
             "is_init": is_init,
             "next": {
                 "pixels": (256 * uniform(3, *size)).to(torch.uint8),

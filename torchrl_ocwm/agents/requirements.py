@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import torch
 from tensordict.utils import NestedKey
@@ -16,30 +16,35 @@ from torchrl_ocwm.data import EpisodeDataset, RelabelGoals
 #: How to get what recordings may lack.
 REMEDIES: dict[NestedKey, str] = {
     ("next", "masks"): "masks of each object come from a segmentation of the images, such as ColourMasks",
-    ("next", "object_position"): "positions come from masks and a calibrated camera (MaskToPosition), or do without "
-    "them: agent=lexa_cosine with agent.world_model.observed=[proprio]",
+    ("next", "object_position"): "positions come from masks and a calibrated camera (MaskToPosition), and goals and "
+    "rewards from positions (RelabelGoals); agent=lexa_cosine does without them if "
+    "agent.world_model.observed=[proprio]",
     ("next", "object_visible"): "object_visible is true where a position is known, and MaskToPosition writes it",
-    ("next", "reward"): "rewards are written for any goal where there are positions (RelabelGoals)",
-    ("next", "goal_position"): "goals are drawn where there are positions (RelabelGoals)",
 }
+#: What there is wherever there are positions.
+_FROM_POSITIONS = {("next", "object_visible"), *RelabelGoals.written}
 
 
 def lacking(agent: Agent, dataset: EpisodeDataset) -> list[NestedKey]:
-    """Keys that an agent learns from, and that a dataset neither holds nor gets as it is sampled."""
+    """Keys that an agent learns from, and that a dataset neither holds nor gets as it is sampled.
+
+    What comes with positions is left out where these are among them.
+    """
     there = {*dataset.records.keys(True, True)}
     if ("next", "object_position") in there:
         there |= {*RelabelGoals.written}
-    return [key for key in agent.loss.in_keys if key not in there]
+    missing = [key for key in agent.loss.in_keys if key not in there]
+    return [key for key in missing if key not in _FROM_POSITIONS or ("next", "object_position") not in missing]
 
 
-def remedies(keys: list[NestedKey]) -> str:
+def remedies(keys: Iterable[NestedKey]) -> str:
     """What to do about missing keys, in words.
 
     Examples:
-        >>> remedies([("next", "reward")])
-        'rewards are written for any goal where there are positions (RelabelGoals)'
+        >>> remedies([("next", "masks")])
+        'masks of each object come from a segmentation of the images, such as ColourMasks'
     """
-    return "; ".join(REMEDIES.get(key, f"{key} has to be recorded") for key in keys)
+    return "; ".join(REMEDIES.get(key, f"{_name(key)} has to be recorded") for key in keys)
 
 
 def ruled_out(dataset: EpisodeDataset, agents: Mapping[str, AgentConfig] = AGENTS) -> str | None:
@@ -52,12 +57,20 @@ def ruled_out(dataset: EpisodeDataset, agents: Mapping[str, AgentConfig] = AGENT
         ...     ruled_out(random_dataset(folder + "/data", reacher_task(), episodes=1)) is None
         True
     """
-    lacks = {name: keys for name, row in agents.items() if (keys := lacking(_outline(row, dataset), dataset))}
-    if not lacks:
-        return None
+    lacks = {name: lacking(_outline(row, dataset), dataset) for name, row in agents.items()}
     missing = list(dict.fromkeys(key for keys in lacks.values() for key in keys))
-    by_key = [f"{'.'.join(key)} ({', '.join(name for name in lacks if key in lacks[name])})" for key in missing]
-    return f"{dataset.path}: lacks what some agents learn from: {', '.join(by_key)}. {remedies(missing)}"
+    if not missing:
+        return None
+    who = {key: [name for name in agents if key in lacks[name]] for key in missing}
+    listed = ", ".join(
+        f"{_name(key)} (for {'all agents' if len(names) == len(agents) else ', '.join(names)})"
+        for key, names in who.items()
+    )
+    return f"{dataset.path}: lacks {listed}. {remedies(missing)}"
+
+
+def _name(key: NestedKey) -> str:
+    return key if isinstance(key, str) else str(key[-1])
 
 
 def _outline(row: AgentConfig, dataset: EpisodeDataset) -> Agent:

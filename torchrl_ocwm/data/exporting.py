@@ -21,7 +21,11 @@ Arrays = dict[str, np.ndarray]
 
 
 def export_dataset(
-    dataset: EpisodeDataset, destination: str | Path, format: Format, *, fps: int = 10  # noqa: A002
+    dataset: EpisodeDataset,
+    destination: str | Path,
+    format: Format,  # noqa: A002
+    *,
+    fps: int = 10,
 ) -> None:
     """Write the episodes of a dataset in a format of others; :func:`~torchrl_ocwm.data.import_dataset` reads it again.
 
@@ -133,7 +137,7 @@ def _space(spaces: Any, array: np.ndarray) -> Any:
 
 
 def _write_lerobot(dataset: EpisodeDataset, destination: Path, task: Task, fps: int) -> None:
-    with needs("writing a LeRobot dataset", "lerobot"):
+    with needs("writing a LeRobot dataset", ""):
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
     names = {"pixels": "observation.images.camera", "proprio": "observation.state", "action": "action"}
     written = None

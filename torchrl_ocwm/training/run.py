@@ -209,8 +209,7 @@ def check_task(agent: Agent, dataset: EpisodeDataset) -> None:
     """
     if dataset.task != agent.task:
         raise DatasetError(f"{dataset.path}: holds {dataset.task}, but the agent was built for {agent.task}")
-    missing = lacking(agent, dataset)
-    if missing:
+    if missing := lacking(agent, dataset):
         raise DatasetError(f"{dataset.path}: holds no {missing}, which this agent learns from. {remedies(missing)}")
     imagined = [name for name, one in agent.config.behaviours.items() if one.goals.gives]
     if dataset.images_show_goal and imagined:
