@@ -29,6 +29,8 @@ from torchrl_ocwm.agents.rewards import (
     TemporalDistance,
 )
 from torchrl_ocwm.agents.scene import Scene
+from torchrl_ocwm.agents.sources import agent_file, shipped_agents
+from torchrl_ocwm.agents.weights import AgentWeights
 from torchrl_ocwm.agents.world_models import Flat, ObjectCentric, WorldModelPart
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.parts import register
@@ -40,6 +42,7 @@ __all__ = [
     "Adam",
     "Agent",
     "AgentConfig",
+    "AgentWeights",
     "Architecture",
     "Behaviour",
     "Disagreement",
@@ -77,6 +80,7 @@ __all__ = [
     "TemporalDistance",
     "UniformGoalSource",
     "WorldModelPart",
+    "agent_file",
     "agent_name",
     "build_agent",
     "collecting_policy",
@@ -87,4 +91,5 @@ __all__ = [
     "remedies",
     "ruled_out",
     "save_agent",
+    "shipped_agents",
 ]
