@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from torchrl_ocwm.agents import build_agent
 from torchrl_ocwm.data import EpisodeDataset, Importing, Keys, import_dataset
 from torchrl_ocwm.data.formats import SourceError
 from torchrl_ocwm.envs import ActionRange
+from torchrl_ocwm.recipes import export_data, import_data
 from torchrl_ocwm.settings import to_dict
 from torchrl_ocwm.testing import random_records, reacher_task
 
@@ -118,3 +120,23 @@ def test_discrete_actions_are_one_of_so_many(source: Path, tmp_path: Path) -> No
     agent = build_agent("dreamer_pcp", task, "debug")
     step = random_records(task, 6, 1)[:, 0]["next"].set("is_init", torch.ones(6, 1, dtype=torch.bool))
     assert agent.policy()(step)["action"].sort(-1).values.tolist() == [[0, 0, 0, 1]] * 6
+
+
+@shows("ImportData.source", "ImportData.dataset")
+@shows("ExportData.dataset", "ExportData.format", "ExportData.destination", "ExportData.fps")
+def test_what_the_recipes_read_and_write(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(recipe: Any, *arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["ocwm", *arguments])
+        recipe.main()
+
+    keys = ("keys.pixels=camera", "keys.proprio=joints", "keys.action=command", "keys.object_position=where")
+    with pytest.warns(UserWarning, match="lacks masks"):
+        run(import_data, f"source={source}", f"dataset={tmp_path / 'data'}", *keys)
+    assert len(EpisodeDataset.open(tmp_path / "data")) == 2
+    run(export_data, f"dataset={tmp_path / 'data'}", "format=npz", f"destination={tmp_path / 'out'}")
+    assert len(list((tmp_path / "out").glob("*.npz"))) == 2
+
+    seen: dict[str, Any] = {}
+    monkeypatch.setattr(export_data, "export_dataset", lambda *_, **settings: seen.update(settings))
+    run(export_data, f"dataset={tmp_path / 'data'}", "format=lerobot", "destination=out", "fps=7")
+    assert seen == {"fps": 7}
