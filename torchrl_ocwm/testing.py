@@ -38,9 +38,6 @@ def random_records(task: Task, batch: int, time: int, *, seed: int = 0) -> Tenso
     def uniform(*features: int) -> torch.Tensor:
         return torch.rand(*shape, *features, generator=generator)
 
-    action = 2 * uniform(task.action) - 1
-    if task.discrete:
-        action = one_hot(action.argmax(-1), task.action).float()
     is_init = torch.zeros(*shape, 1, dtype=torch.bool)
     is_init[:, 0] = True
     position = torch.stack([task.workspace.sample(shape, generator) for _ in range(objects)], -2)
@@ -48,7 +45,7 @@ def random_records(task: Task, batch: int, time: int, *, seed: int = 0) -> Tenso
     done = torch.zeros(*shape, 1, dtype=torch.bool)
     return TensorDict(
         {
-            "action": action,
+            "action": _action(task, uniform(task.action)),
             "is_init": is_init,
             "next": {
                 "pixels": (256 * uniform(3, *size)).to(torch.uint8),
@@ -64,6 +61,11 @@ def random_records(task: Task, batch: int, time: int, *, seed: int = 0) -> Tenso
         },
         shape,
     )
+
+
+def _action(task: Task, drawn: torch.Tensor) -> torch.Tensor:
+    """Actions ``[..., A]`` of numbers in [0, 1]."""
+    return one_hot(drawn.argmax(-1), task.action).float() if task.discrete else 2 * drawn - 1
 
 
 def random_dataset(path: str | Path, task: Task, *, episodes: int = 4, length: int = 20) -> EpisodeDataset:
