@@ -28,6 +28,7 @@ class ActionRange(Settings):
         SettingsError: if ``low`` is not below ``high`` for every action.
 
     Examples:
+        >>> import torch
         >>> joints = ActionRange(low=(0.0, -2.0), high=(4.0, 2.0))
         >>> joints.normalise(torch.tensor([1.0, 2.0]))
         tensor([-0.5000,  1.0000])
