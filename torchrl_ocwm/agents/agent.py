@@ -32,6 +32,8 @@ class Policy(TensorDictSequential):
     ``latent``, which it reads back at the next step. Actions are the mean of the actor, or drawn from it under
     ``set_exploration_type(ExplorationType.RANDOM)``, which TorchRL's collectors set by themselves.
 
+    After ``agent.bfloat16()`` or ``half()`` it computes in that type, from observations of any and to float32 actions.
+
     Attributes:
         agent: The agent that it belongs to.
         behaviour: The behaviour.
@@ -44,6 +46,12 @@ class Policy(TensorDictSequential):
         self.register_forward_pre_hook(refuse_export_without_latent, with_kwargs=True)
         # Not submodules: the modules hold the parameters.
         self.__dict__["agent"], self.__dict__["behaviour"] = agent, behaviour
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        """Act; takes the arguments of :class:`~tensordict.nn.TensorDictSequential`."""
+        weight = next(self.behaviour.actor.parameters())
+        with torch.autocast(weight.device.type, weight.dtype, enabled=weight.dtype in (torch.bfloat16, torch.float16)):
+            return super().forward(*args, **kwargs)
 
     @property
     def takes_images(self) -> bool:
