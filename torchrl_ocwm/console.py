@@ -16,6 +16,8 @@ COMMANDS = {
     "collect": ("collect", "Collect a dataset."),
     "train": ("train_offline", "Train an agent on a dataset."),
     "train-online": ("train_online", "Train an agent that collects its data."),
+    "import": ("import_data", "Make a dataset of recordings in the formats of others."),
+    "export": ("export_data", "Write a dataset in a format of others."),
     "evaluate": ("evaluate", "Score agents on a grid of goals; tables, pictures, videos."),
     "diagnose": ("diagnose", "Look into a world model: masks, positions, goal latents."),
     "reproduce": ("reproduce", "Make a table or figure of the paper, from nothing."),

@@ -16,6 +16,7 @@ from torchrl_ocwm.envs.positions import MaskToPosition, hold_last_seen, mask_cen
 from torchrl_ocwm.envs.registry import (
     ENVIRONMENTS,
     EnvChoice,
+    RecordedEnv,
     find_environment,
     make_env,
     make_scene,
@@ -23,7 +24,7 @@ from torchrl_ocwm.envs.registry import (
     register_environment,
 )
 from torchrl_ocwm.envs.scripted import ScriptedAction
-from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.envs.task import ActionRange, Task
 from torchrl_ocwm.envs.workspace import Workspace
 from torchrl_ocwm.lazy import lazily
 
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ENVIRONMENTS",
+    "ActionRange",
     "Camera",
     "CubeMove",
     "EnvChoice",
@@ -48,6 +50,7 @@ __all__ = [
     "PickPlace",
     "PositioningEnv",
     "Reacher",
+    "RecordedEnv",
     "ScriptedAction",
     "ShelfPlace",
     "SimulationDivergedError",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -90,6 +91,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     #: How far the middle of an object lies behind its visible surface, metres along the optical axis.
     depth_offset: ClassVar[float] = 0.0
     blind: bool = False
+    _made_with: partial[PositioningEnv]
 
     def __init__(
         self,
@@ -132,6 +134,17 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         self._mask_intrinsics = self._intrinsics * torch.tensor([[mask_scale], [mask_scale], [1.0]])
         self.observation_space = self._observation_space()  # type: ignore[assignment]
         self.action_space = spaces.Box(-1.0, 1.0, self._action_shape(), np.float32)
+
+    def __new__(cls, *arguments: Any, **options: Any) -> PositioningEnv:
+        """Keep what it is made with, to make it again where it is unpickled."""
+        env = super().__new__(cls)
+        env._made_with = partial(cls, *arguments, **options)
+        return env
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A simulator is not pickled but made anew, and has to be reset; its random numbers go on."""
+        kept = ("spec", "_np_random", "_np_random_seed")
+        return self._made_with, (), {name: self.__dict__[name] for name in kept if name in self.__dict__}
 
     # What a suite fills in.
 
