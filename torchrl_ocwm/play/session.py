@@ -205,6 +205,10 @@ class Session:
             raise PlayError(f"{error}; a new episode begins") from error
         self._begin(observation, self.goal, self._image)
 
+    def move_object_at_random(self) -> None:
+        """Disturb the agent: put the object to position somewhere in the workspace."""
+        self.move_object(self.env.workspace.sample())
+
     def nearest_object(self, point: Point) -> str:
         """The object that is nearest to a place in the image."""
         names, places = list(self.env.objects), self.env.true_position()

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 from torchrl_ocwm.play.players import Player
-from torchrl_ocwm.play.session import Session
+from torchrl_ocwm.play.session import PlayError, Session
 
 T = TypeVar("T")
 
@@ -22,6 +22,10 @@ class Stage:
         seed: Seeds the episodes.
 
     Close it, or use it in a ``with`` block.
+
+    Attributes:
+        player: Who acts.
+        behaviour: Which behaviour; ``None`` for that which acts unless another is chosen.
     """
 
     def __init__(self, players: Sequence[Player], *, seed: int = 0) -> None:
@@ -36,8 +40,19 @@ class Stage:
             raise
 
     def choose(self, name: str, behaviour: str | None = None) -> None:
-        """Let somebody else act; if that fails, all stays as it was."""
+        """Let somebody else act; if that fails, all stays as it was.
+
+        Args:
+            name: Of a player.
+            behaviour: Which of its behaviours; ``None`` for that which acts unless another is chosen.
+
+        Raises:
+            UserError: for an unknown player, or one that cannot act here.
+        """
+        if name not in self.players:
+            raise PlayError(f"there is no agent {name!r} here; start the page with it, or choose another one")
         self.player = self._thread.submit(self._exchange, self.players[name], behaviour).result()
+        self.behaviour = behaviour or self.player.acting
 
     def do(self, action: Callable[[Session], T]) -> T:
         """Do something with the session, after what is being done."""
