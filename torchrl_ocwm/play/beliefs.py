@@ -27,9 +27,7 @@ def decoded_masks(model: RSSMWorldModel | None, latent: TensorDictBase | None) -
 
 
 @torch.no_grad()
-def decoded_position(
-    model: RSSMWorldModel, latent: TensorDictBase | None, object_index: int
-) -> np.ndarray | None:
+def decoded_position(model: RSSMWorldModel, latent: TensorDictBase | None, object_index: int) -> np.ndarray | None:
     """Where an object is in a latent ``[1]``, (D,) metres from the start; ``None`` from a model that does not say."""
     if latent is None or "object_position" not in model.observed:
         return None

@@ -11,8 +11,9 @@ import numpy as np
 
 from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.errors import UserError
+from torchrl_ocwm.play.errors import PlayError
 from torchrl_ocwm.play.pictures import camera_picture, imagined_picture, masks_picture, numbers
-from torchrl_ocwm.play.session import PlayError, Session
+from torchrl_ocwm.play.session import Session
 from torchrl_ocwm.play.stage import Stage
 
 with needs("the page", "play"):
@@ -22,9 +23,9 @@ _HERE = Path(__file__).parent
 _AXES = "xyz"
 _NOTICE = 8  # seconds
 _LEGEND = """\
-**Click** into the camera's picture to set the goal (red cross), inside the thin line. **Drag** an object to move it.
-Or use the sliders and buttons below. The ring is where the world model believes the object to be; in the imagined
-picture, where it expects it."""
+**Click** into the large picture to set the goal, the red cross, inside the dashed line. **Drag** an object to move it.
+The sliders and buttons do the same. The blue ring is where the world model believes the object to be, the brown one
+where it is in what the agent imagined."""
 
 
 class Page:
@@ -48,14 +49,13 @@ class Page:
             self._lay_out()
             self._connect()
 
-    def launch(self, *, host: str = "127.0.0.1", port: int | None = None, browser: bool = False, block: bool = True) -> str:
-        """Serve the page.
+    def launch(self, *, host: str = "127.0.0.1", port: int | None = None, browser: bool = False) -> str:
+        """Serve the page, in threads of its own.
 
         Args:
             host: Address to listen at. ``0.0.0.0`` opens it to the network: whoever reaches it can steer.
             port: Port; ``None`` for the first free one from 7860.
             browser: Open it in the browser of this machine.
-            block: Stay until Ctrl-C.
 
         Returns:
             The page's address.
@@ -68,7 +68,7 @@ class Page:
                 server_name=host,
                 server_port=port,
                 inbrowser=browser,
-                prevent_thread_lock=not block,
+                prevent_thread_lock=True,
                 share=False,
                 ssr_mode=False,
                 mcp_server=False,
@@ -79,7 +79,9 @@ class Page:
                 css_paths=_HERE / "page.css",
             )
         except OSError as error:
-            raise PlayError(f"cannot serve at {host}, port {port} ({error}); choose another one with port=...") from error
+            raise PlayError(
+                f"cannot serve at {host}, port {port} ({error}); choose another one with port=..."
+            ) from error
         return address
 
     def close(self) -> None:
@@ -94,23 +96,26 @@ class Page:
                 script = (_HERE / "page.js").read_text()
                 self.camera = gr.HTML(js_on_load=script, elem_id="camera", apply_default_css=False)
                 self.numbers = gr.HTML(elem_id="numbers", apply_default_css=False)
-            with gr.Column(scale=1, min_width=200):
-                gr.Markdown("**Imagined** since the goal was set")
-                self.imagined = gr.HTML(elem_id="imagined", apply_default_css=False)
-            with gr.Column(scale=1, min_width=200):
-                gr.Markdown("**Decoded masks** of what it sees")
-                self.masks = gr.HTML(elem_id="masks", apply_default_css=False)
+            with gr.Column(scale=1, min_width=200), gr.Row():
+                with gr.Column(min_width=140):
+                    gr.Markdown("**Imagined** since the goal was set")
+                    self.imagined = gr.HTML(elem_id="imagined", apply_default_css=False)
+                with gr.Column(min_width=140):
+                    gr.Markdown("**Decoded masks** of what it sees")
+                    self.masks = gr.HTML(elem_id="masks", apply_default_css=False)
         gr.Markdown(_LEGEND)
         with gr.Row():
             self.pause = gr.Button("Pause", elem_id="pause")
             self.episode = gr.Button("New episode", elem_id="episode")
             self.push = gr.Button("Move the object at random", elem_id="push")
         with gr.Row():
-            self.sliders = [gr.Slider(-1, 1, elem_id=f"goal-{axis}") for axis in _AXES]
+            self.sliders = [gr.Slider(-1, 1, elem_id=f"goal-{axis}", buttons=[]) for axis in _AXES]
         with gr.Row():
             self.environment = gr.Dropdown(self._environments(), label="Environment", elem_id="environment")
-            self.agent = gr.Dropdown(self._agents(), label="Agent", elem_id="agent", allow_custom_value=True)
-            self.behaviour = gr.Dropdown([], label="Behaviour (object)", elem_id="behaviour", allow_custom_value=True)
+            self.agent = gr.Dropdown(self._agents(), label="Agent", elem_id="agent")
+            self.behaviour = gr.Dropdown(
+                self.stage.player.behaviours(), label="Behaviour (object)", elem_id="behaviour"
+            )
         with gr.Accordion("Goal images", open=False) as self.images:
             self.as_image = gr.Checkbox(False, label="Give the agent clicked goals as images", elem_id="as-image")
             self.gallery = gr.Gallery(label="Pick a goal image", columns=5, allow_preview=False, elem_id="gallery")
@@ -120,15 +125,15 @@ class Page:
     def _connect(self) -> None:
         frame = [self.camera, self.numbers, self.imagined, self.masks]
         steered = [*frame, *self.sliders]
-        everything = [*steered, self.environment, self.agent, self.behaviour, self.images, self.gallery]
+        everything = [*steered, self.pause, self.environment, self.agent, self.behaviour, self.images, self.gallery]
         quiet: dict[str, Any] = {"show_progress": "hidden", "api_visibility": "private"}
         self.blocks.load(self.all, None, everything, **quiet)
         self.timer.tick(self.tick, None, frame, **quiet)
         self.camera.click(self.click, self.as_image, steered, **quiet)
         self.camera.release(self.drag, None, steered, **quiet)
         for slider in self.sliders:
-            slider.release(self.slide, [self.as_image, *self.sliders], steered, **quiet)
-        self.pause.click(self.toggle, None, [self.pause, self.timer], **quiet)
+            slider.input(self.slide, [self.as_image, *self.sliders], frame, trigger_mode="always_last", **quiet)
+        self.pause.click(self.toggle, None, self.pause, **quiet)
         self.episode.click(lambda: self.steer(Session.reset), None, steered, **quiet)
         self.push.click(lambda: self.steer(Session.move_object_at_random), None, steered, **quiet)
         self.environment.input(self.choose_environment, self.environment, everything, **quiet)
@@ -146,42 +151,46 @@ class Page:
 
     # What happens.
 
-    def tick(self) -> list[str]:
+    def tick(self) -> list[Any]:
         """A step, and what is to be seen then."""
+        if not self.running:
+            return [gr.skip()] * 4
         _warned(self.stage.do, Session.step)
         return self.frame()
 
-    def toggle(self) -> tuple[Any, Any]:
-        """Stop, or go on."""
+    def toggle(self) -> str:
+        """Stop, or go on; what the button says then."""
         self.running = not self.running
-        return gr.Button("Pause" if self.running else "Go on"), gr.Timer(active=self.running)
+        return self._pause_label()
+
+    def _pause_label(self) -> str:
+        return "Pause" if self.running else "Go on"
 
     def click(self, as_image: bool, event: gr.EventData) -> list[Any]:
         """Set the goal to where somebody clicked."""
-        return self.steer(lambda session: session.set_goal(session.position_at(event.to), as_image=as_image))
+        return self.steer(lambda session: session.set_goal(session.places.position(event.to), as_image=as_image))
 
     def drag(self, event: gr.EventData) -> list[Any]:
         """Move the object that is nearest to where a drag began to where it ended."""
 
         def move(session: Session) -> None:
-            session.move_object(session.position_at(event.to), session.nearest_object(event.begin))
+            session.move_object(session.places.position(event.to), session.places.nearest_object(event.begin))
 
         return self.steer(move)
 
-    def slide(self, as_image: bool, *centimetres: float) -> list[Any]:
+    def slide(self, as_image: bool, *centimetres: float) -> list[str]:
         """Set the goal to where the sliders are."""
 
         def set_goal(session: Session) -> None:
             position = np.array(centimetres[: session.env.workspace.dim]) / 100
             session.set_goal(position, as_image=as_image)
 
-        return self.steer(set_goal)
+        _warned(self.stage.do, set_goal)
+        return self.frame()
 
     def pick(self, event: gr.SelectData) -> list[Any]:
         """Set the goal to the image that was picked."""
-        return self.steer(
-            lambda session: session.set_goal(session.env.workspace.landmarks[event.index], as_image=True)
-        )
+        return self.steer(lambda session: session.set_goal(session.env.workspace.landmarks[event.index], as_image=True))
 
     def drop(self, image: np.ndarray) -> list[Any]:
         """Set the goal to an image of somebody else's."""
@@ -216,6 +225,7 @@ class Page:
         return [
             *self.frame(),
             *self.stage.do(_sliders),
+            self._pause_label(),
             player.environment,
             gr.Dropdown(self._agents(), value=player.name),
             gr.Dropdown(behaviours, value=self.stage.behaviour or behaviours[0][1]),
@@ -229,7 +239,9 @@ def _sliders(session: Session) -> list[Any]:
     workspace, axes = session.env.workspace, session.env.axes
     goal = session.env.goal_position
     shown = [
-        gr.Slider(100 * low, 100 * high, value=round(100 * at, 1), step=0.5, label=f"Goal {_AXES[axis]}, cm", visible=True)
+        gr.Slider(
+            100 * low, 100 * high, value=round(100 * at, 1), step=0.5, label=f"Goal {_AXES[axis]}, cm", visible=True
+        )
         for low, high, at, axis in zip(workspace.low, workspace.high, goal.tolist(), axes, strict=True)
     ]
     return shown + [gr.Slider(visible=False)] * (len(_AXES) - len(shown))

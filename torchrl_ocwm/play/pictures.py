@@ -10,7 +10,8 @@ from io import BytesIO
 import numpy as np
 from PIL import Image
 
-from torchrl_ocwm.play.session import Point, View
+from torchrl_ocwm.play.places import Point
+from torchrl_ocwm.play.session import View
 
 _COLOURS = np.array([(255, 210, 60), (80, 170, 255), (255, 120, 200), (120, 230, 120)], np.float32)
 _QUALITY = 85
@@ -33,7 +34,7 @@ def masks_picture(view: View) -> str:
     """The masks that the world model sees, in the colours of the objects, over what there is; a text if it has none."""
     if view.masks is None:
         return _nothing("There are no decoded masks: this agent has no object-centric world model.")
-    return picture(tinted(view.seen, view.masks), "Decoded masks", {"goal": view.goal, "believed": view.believed})
+    return picture(tinted(view.seen, view.masks), "Decoded masks", {})
 
 
 def numbers(view: View) -> str:
@@ -60,17 +61,15 @@ def tinted(pixels: np.ndarray, masks: np.ndarray) -> np.ndarray:
 
     Examples:
         >>> tinted(np.full((1, 2, 3), 100, np.uint8), np.array([[[0.0, 1.0]]]))[0].tolist()
-        [[40, 40, 40], [255, 210, 60]]
+        [[50, 50, 50], [255, 210, 60]]
     """
-    image = 0.4 * pixels.astype(np.float32)
+    image = 0.5 * pixels.astype(np.float32)
     for number, mask in enumerate(masks[..., None]):
         image = (1 - mask) * image + mask * _COLOURS[number % len(_COLOURS)]
     return image.clip(0, 255).astype(np.uint8)
 
 
-def picture(
-    pixels: np.ndarray, label: str, marks: Mapping[str, Point | None], outline: Sequence[Point] = ()
-) -> str:
+def picture(pixels: np.ndarray, label: str, marks: Mapping[str, Point | None], outline: Sequence[Point] = ()) -> str:
     """An image with marks, as HTML.
 
     Args:

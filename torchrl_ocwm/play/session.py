@@ -13,17 +13,11 @@ from torch.nn.functional import interpolate
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_ocwm.agents import Policy
-from torchrl_ocwm.envs import Camera, SimulationDivergedError, Workspace, find_environment, make_scene
-from torchrl_ocwm.errors import UserError
+from torchrl_ocwm.envs import Camera, PositioningEnv, SimulationDivergedError, find_environment, make_scene
 from torchrl_ocwm.evaluation import imagined_rollout, normalized_score
 from torchrl_ocwm.play.beliefs import decoded_masks, decoded_pixels, decoded_position
-
-_MARGIN = 0.1  # of the workspace's width: a click so far outside still means its edge
-Point = tuple[float, float]
-
-
-class PlayError(UserError, ValueError):
-    """Something that was asked for on the page and cannot be done."""
+from torchrl_ocwm.play.errors import PlayError
+from torchrl_ocwm.play.places import Places, Point
 
 
 class View(NamedTuple):
@@ -73,8 +67,12 @@ class Session:
         seed: Seeds the episodes.
         size: Height and width of the camera's picture, pixels.
 
+    Raises:
+        PlayError: for an environment that is no :class:`~torchrl_ocwm.envs.PositioningEnv`.
+
     Attributes:
         env: The environment.
+        places: Where positions are in the picture.
         goal: Goal position (D,), metres; ``None`` for a goal image whose place is not known.
         steps: Steps since the goal was set.
 
@@ -98,10 +96,14 @@ class Session:
         size: int = 384,
     ) -> None:
         self.policy, self.seed = policy, seed
+        self._imagined: TensorDictBase | None = None
+        self._scores: list[float | None] = []
         self.object_index = 0 if policy is None else policy.object_index
         self.env = make_scene(find_environment(environment), **(options or {}))
         try:
-            self._corners = _corners(self.env.workspace)
+            if not isinstance(self.env, PositioningEnv):
+                raise PlayError(f"environment {environment!r} is no PositioningEnv; only those can be played with")
+            self.places = Places(self.env)
             self._camera = Camera(self.env.model, self.env.camera_name, height=size, width=size)
             self.reset()
         except BaseException:
@@ -209,28 +211,6 @@ class Session:
         """Disturb the agent: put the object to position somewhere in the workspace."""
         self.move_object(self.env.workspace.sample())
 
-    def nearest_object(self, point: Point) -> str:
-        """The object that is nearest to a place in the image."""
-        names, places = list(self.env.objects), self.env.true_position()
-        apart = [np.subtract(self._point(place), point) for place in places]
-        return names[int(np.argmin([np.linalg.norm(one) for one in apart]))]
-
-    def position_at(self, point: Point) -> np.ndarray:
-        """The position (D,) in the workspace, metres, at a place in the image. Beside its edge the edge is meant.
-
-        Raises:
-            PlayError: for a place far from the workspace.
-        """
-        low, high = np.array(self.env.workspace.low), np.array(self.env.workspace.high)
-        try:
-            position = self.env.unproject(self.env.image_size * np.asarray(point))
-        except ValueError as error:
-            raise PlayError(str(error)) from error
-        inside = position.clip(low, high)
-        if (abs(position - inside) > _MARGIN * (high - low)).any():
-            raise PlayError(f"{_in_cm(position)} is outside the workspace, from {_in_cm(low)} to {_in_cm(high)}")
-        return inside
-
     # What is to be seen.
 
     @property
@@ -250,8 +230,8 @@ class Session:
             seen=self._seen["pixels"].transpose(1, 2, 0),
             imagined=decoded_pixels(model, self._imagined),
             masks=decoded_masks(model, latent),
-            workspace=[self._point(corner) for corner in self._corners],
-            goal=None if self.goal is None else self._point(self.goal),
+            workspace=self.places.corners(),
+            goal=None if self.goal is None else self.places.point(self.goal),
             believed=self._decoded_point(latent),
             expected=self._decoded_point(self._imagined),
             distance=self.distance,
@@ -285,7 +265,8 @@ class Session:
         if image is not None:
             self._before["goal", "pixels"] = image
         self._think(observation)
-        self._imagined = None if self.policy is None else self._now["latent"].select("state", "belief", "goal", strict=False)
+        if self.policy is not None:
+            self._imagined = self._now["latent"].select("state", "belief", "goal", strict=False)
         self._scores = [self._score()]
 
     @torch.no_grad()
@@ -318,21 +299,6 @@ class Session:
         except ValueError as error:
             raise PlayError(str(error)) from error
 
-    def _point(self, position: np.ndarray) -> Point:
-        column, row = self.env.project(position) / self.env.image_size
-        return float(column), float(row)
-
     def _decoded_point(self, latent: TensorDictBase | None) -> Point | None:
         position = None if self.policy is None else decoded_position(self.policy.agent.model, latent, self.object_index)
-        return None if position is None else self._point(position)
-
-
-def _corners(workspace: Workspace) -> list[np.ndarray]:
-    """The corners of the lowest rectangle of a workspace, one after the other around it."""
-    low, high = np.array(workspace.low, np.float32), np.array(workspace.high, np.float32)
-    turns = [(0, 0), (1, 0), (1, 1), (0, 1)]
-    return [np.array([*np.where(turn, high[:2], low[:2]), *low[2:]], np.float32) for turn in turns]
-
-
-def _in_cm(position: np.ndarray) -> str:
-    return f"({', '.join(f'{100 * value:.0f}' for value in position)}) cm"
+        return None if position is None else self.places.point(position)

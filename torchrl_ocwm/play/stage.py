@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+from torchrl_ocwm.play.errors import PlayError
 from torchrl_ocwm.play.players import Player
-from torchrl_ocwm.play.session import PlayError, Session
+from torchrl_ocwm.play.session import Session
 
 T = TypeVar("T")
 

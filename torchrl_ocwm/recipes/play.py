@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from threading import Event
 
 from torchrl_ocwm.recipes import recipe
 from torchrl_ocwm.settings import Settings, setting
@@ -38,15 +39,19 @@ class Play(Settings):
 @recipe("play")
 @ended_by_signals()
 def main(config: Play) -> None:
+    """Serve the page until Ctrl-C."""
     from torchrl_ocwm.play import Stage, find_players
     from torchrl_ocwm.play.page import Page
 
     with Stage(find_players([config.agent, *config.others], config.behaviour), seed=config.seed) as stage:
         page = Page(stage, rate=config.rate)
-        address = page.launch(host=config.host, port=config.port, browser=config.browser, block=False)
+        address = page.launch(host=config.host, port=config.port, browser=config.browser)
         sys.stdout.write(f"The page is at {address} until Ctrl-C.\n")
         sys.stdout.flush()
-        page.blocks.block_thread()
+        try:
+            Event().wait()
+        finally:
+            page.close()
 
 
 if __name__ == "__main__":
