@@ -96,13 +96,12 @@ class Page:
                 script = (_HERE / "page.js").read_text()
                 self.camera = gr.HTML(js_on_load=script, elem_id="camera", apply_default_css=False)
                 self.numbers = gr.HTML(elem_id="numbers", apply_default_css=False)
-            with gr.Column(scale=1, min_width=200), gr.Row():
-                with gr.Column(min_width=140):
-                    gr.Markdown("**Imagined** since the goal was set")
-                    self.imagined = gr.HTML(elem_id="imagined", apply_default_css=False)
-                with gr.Column(min_width=140):
-                    gr.Markdown("**Decoded masks** of what it sees")
-                    self.masks = gr.HTML(elem_id="masks", apply_default_css=False)
+            with gr.Column(scale=1, min_width=120):
+                gr.Markdown("**Imagined** since the goal was set")
+                self.imagined = gr.HTML(elem_id="imagined", apply_default_css=False)
+            with gr.Column(scale=1, min_width=120):
+                gr.Markdown("**Decoded masks** of what it sees")
+                self.masks = gr.HTML(elem_id="masks", apply_default_css=False)
         gr.Markdown(_LEGEND)
         with gr.Row():
             self.pause = gr.Button("Pause", elem_id="pause")
@@ -252,7 +251,7 @@ def _warned(function: Callable[..., Any], *arguments: Any) -> None:
     try:
         function(*arguments)
     except UserError as error:
-        gr.Warning(escape(str(error)), duration=_NOTICE)
+        gr.Warning(escape(str(error)), duration=_NOTICE, title="Not possible")
 
 
 def _theme() -> gr.themes.Base:

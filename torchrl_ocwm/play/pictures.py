@@ -79,7 +79,7 @@ def picture(pixels: np.ndarray, label: str, marks: Mapping[str, Point | None], o
         outline: Corners of a line around something.
     """
     corners = " ".join(f"{column:.4f},{row:.4f}" for column, row in outline)
-    lines = [f'<polygon class="workspace" points="{corners}"/>'] if corners else []
+    lines = [f'<polygon class="workspace{more}" points="{corners}"/>' for more in (" halo", "") if corners]
     lines += [_mark(kind, *place) for kind, place in marks.items() if place is not None]
     drawing = f'<svg viewBox="0 0 1 1" preserveAspectRatio="none" aria-hidden="true">{"".join(lines)}</svg>'
     return f'<div class="picture"><img alt="{escape(label)}" draggable="false" src="{_data(pixels)}">{drawing}</div>'
