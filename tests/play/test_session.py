@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium
@@ -16,7 +17,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl_ocwm.agents import AGENTS, Agent, AgentConfig, build_agent, save_agent
 from torchrl_ocwm.envs import PositioningEnv, make_task, register_environment
 from torchrl_ocwm.evaluation import normalized_score
-from torchrl_ocwm.play import PlayError, Player, Session, Stage, find_players
+from torchrl_ocwm.play import Player, PlayError, Session, Stage, find_players
 from torchrl_ocwm.play.beliefs import decoded_position
 from torchrl_ocwm.settings import change
 
@@ -31,7 +32,7 @@ def session() -> Iterator[Session]:
 def play(make_agent: Callable[..., Agent]) -> Iterator[Callable[..., Session]]:
     opened: list[Session] = []
 
-    def make(row: str = "focus_lcp", changes: dict[str, Any] = {}) -> Session:
+    def make(row: str = "focus_lcp", changes: Mapping[str, Any] = MappingProxyType({})) -> Session:
         opened.append(Session("reacher", make_agent(row, changes).policy(), size=96))
         return opened[-1]
 
