@@ -21,7 +21,7 @@ from torchrl_ocwm.play.page import Page
 
 HERE = Path(__file__).parent
 SECONDS, RATE = 20, 8
-WIDTH, HEIGHT = 920, 690
+WIDTH, HEIGHT = 920, 560
 #: At which picture what is done, with positions in metres.
 SCRIPT = {
     4: ("click", (-0.12, 0.12)),
@@ -31,8 +31,8 @@ SCRIPT = {
     132: ("click", (0.18, 0.05)),
 }
 CURSOR = """
-document.body.insertAdjacentHTML("beforeend", '<div id="cursor" style="position:fixed;width:22px;height:22px;' +
-  'margin:-11px;border-radius:50%;background:#0008;border:2px solid white;z-index:99;pointer-events:none"></div>');
+document.body.insertAdjacentHTML("beforeend", '<div id="cursor" style="position:fixed;width:14px;height:14px;' +
+  'margin:-7px;border-radius:50%;background:#fff6;border:2px solid #000;z-index:99;pointer-events:none"></div>');
 document.addEventListener("pointermove", (e) => cursor.style.translate = `${e.clientX}px ${e.clientY}px`, true);
 """
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_ocwm import load_agent
+from torchrl_ocwm.agents import Agent
 from torchrl_ocwm.play import Player, Stage, find_players
 
 pytest.importorskip("gradio")
@@ -22,6 +24,7 @@ from torchrl_ocwm.play.page import Page  # noqa: E402
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SHIPPED = "reacher/focus_lcp"
 PATIENCE = 60_000  # milliseconds, on a machine with other work
+DISTANCE = "parseFloat(document.querySelector('#distance').textContent)"
 
 pytestmark = [
     pytest.mark.slow,
@@ -57,10 +60,21 @@ class Visit:
         box = self.tab.locator("#camera img").bounding_box()
         return box["x"] + place[0] * box["width"], box["y"] + place[1] * box["height"]
 
-    def goal_is(self, x: float, y: float) -> bool:
-        """Whether the goal is there, up to a pixel of the screen."""
-        goal = self.stage.do(lambda session: session.goal)
-        return np.allclose(goal, (x, y), atol=0.003)
+    def until_true(self, condition: Callable[[], bool]) -> None:
+        """Wait for a condition of the simulation."""
+        deadline = time.monotonic() + PATIENCE / 1000
+        while not condition():
+            assert time.monotonic() < deadline
+            self.tab.wait_for_timeout(50)
+
+    def until_goal(self, x: float, y: float) -> None:
+        """Wait until the goal is there, up to a pixel of the screen."""
+        self.until_true(lambda: np.allclose(self.stage.do(lambda session: session.goal), (x, y), atol=0.003))
+
+    def until_there(self) -> None:
+        """Wait until the object is within 5 cm of the goal, and the page shows it."""
+        self.until_true(lambda: self.stage.do(lambda session: session.distance) < 0.05)
+        self.until(f"{DISTANCE} < 5")
 
     def until(self, condition: str) -> None:
         """Wait for a condition in JavaScript."""
@@ -99,7 +113,6 @@ def stage() -> Iterator[Stage]:
         yield stage
 
 
-DISTANCE = "parseFloat(document.querySelector('#distance').textContent)"
 #: What is around the element that gets the keys.
 FOCUSED = "[...document.querySelectorAll('[id]')].filter(e => e.contains(document.activeElement)).map(e => e.id)"
 
@@ -107,13 +120,11 @@ FOCUSED = "[...document.querySelectorAll('[id]')].filter(e => e.contains(documen
 def test_click_a_goal_and_see_the_distance_fall(stage: Stage, visit: Callable[..., Any]) -> None:
     with visit(stage) as one:
         one.tab.mouse.click(*one.at(-0.15, 0.05))
-        one.until("+document.querySelector('#steps').textContent > 1")
-        assert one.goal_is(-0.15, 0.05)
-        one.until(f"{DISTANCE} < 5")
+        one.until_goal(-0.15, 0.05)
+        one.until_there()
         one.tab.mouse.click(*one.at(0.15, -0.05))  # the other side of the arm
         one.until(f"{DISTANCE} > 15")
-        one.until(f"{DISTANCE} < 5")
-        assert stage.do(lambda session: session.distance) < 0.05
+        one.until_there()
 
 
 def is_shipped() -> bool:
@@ -129,9 +140,8 @@ def test_the_shipped_agent_comes_within_five_centimetres(visit: Callable[..., An
     with Stage(find_players([SHIPPED])) as stage, visit(stage) as one:
         for goal in ((-0.15, 0.05), (0.1, 0.1)):
             one.tab.mouse.click(*one.at(*goal))
-            one.until("+document.querySelector('#steps').textContent > 3")
-            one.until(f"{DISTANCE} < 5")
-            assert one.goal_is(*goal)
+            one.until_goal(*goal)
+            one.until_there()
 
 
 def test_drag_the_object(stage: Stage, visit: Callable[..., Any]) -> None:
@@ -158,8 +168,7 @@ def test_all_can_be_done_with_keys(stage: Stage, visit: Callable[..., Any]) -> N
         for _ in range(4):
             one.tab.keyboard.press("ArrowLeft")
         one.until("document.querySelector('#goal-x input[type=number]').value == 8")
-        one.tab.wait_for_timeout(500)
-        assert one.goal_is(0.08, 0.1)
+        one.until_goal(0.08, 0.1)
         reached: set[str] = set()
         for _ in range(30):
             one.tab.keyboard.press("Tab")
@@ -174,8 +183,8 @@ def test_a_phone(stage: Stage, visit: Callable[..., Any]) -> None:
         assert one.tab.locator("#camera img").bounding_box()["width"] > 280
         assert one.tab.locator("#distance").bounding_box()["y"] < 844
         one.tab.touchscreen.tap(*one.at(-0.15, 0.05))
-        one.until(f"{DISTANCE} < 5")
-        assert one.goal_is(-0.15, 0.05)
+        one.until_goal(-0.15, 0.05)
+        one.until_there()
 
 
 def test_a_click_outside_is_explained(stage: Stage, visit: Callable[..., Any]) -> None:
@@ -183,3 +192,18 @@ def test_a_click_outside_is_explained(stage: Stage, visit: Callable[..., Any]) -
         box = one.tab.locator("#camera img").bounding_box()
         one.tab.mouse.click(box["x"] + 4, box["y"] + 4)
         one.tab.get_by_text("outside the workspace").wait_for(timeout=PATIENCE)
+
+
+def test_choose_an_agent_and_pick_a_goal_image(make_agent: Callable[..., Agent], visit: Callable[..., Any]) -> None:
+    players = [Player("reacher/scripted", "reacher"), Player("ours", "reacher", make_agent("focus_lcp"))]
+    with Stage(players) as stage, visit(stage) as one:
+        assert "imagines nothing" in one.tab.inner_text("#imagined")
+        one.tab.click("#agent input")
+        one.tab.get_by_role("option", name="ours").click()
+        one.tab.wait_for_selector("#imagined img", timeout=PATIENCE)
+        one.tab.wait_for_selector("#masks img", timeout=PATIENCE)
+        one.tab.get_by_text("Goal images").click()
+        one.tab.locator("#gallery .thumbnail-item").nth(3).click(timeout=PATIENCE)
+        one.until("document.querySelector('#goal-y input[type=number]').value == 24")
+        one.until_goal(0.0, 0.24)
+        assert stage.do(lambda session: "goal" in session._now.keys())
