@@ -16,8 +16,7 @@ import imageio_ffmpeg
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-from torchrl_ocwm.play import Session, Stage, find_players
-from torchrl_ocwm.play.page import Page
+from torchrl_ocwm.play import Page, Session, Stage, find_players
 
 HERE = Path(__file__).parent
 SECONDS, RATE = 20, 8

@@ -40,8 +40,7 @@ class Play(Settings):
 @ended_by_signals()
 def main(config: Play) -> None:
     """Serve the page until Ctrl-C."""
-    from torchrl_ocwm.play import Stage, find_players
-    from torchrl_ocwm.play.page import Page
+    from torchrl_ocwm.play import Page, Stage, find_players  # Gradio takes seconds: not for --help
 
     with Stage(find_players([config.agent, *config.others], config.behaviour), seed=config.seed) as stage:
         page = Page(stage, rate=config.rate)
