@@ -8,10 +8,13 @@ DEMO := outputs/demo
 UPDATES ?= 1500
 STEPS ?= 50000
 WORKERS := 2
+# The series of TorchRL after that of constraints.txt, as far as the package registry has it: the quick tests run with it.
+NEXT := .venv-next
+NEXT_VERSIONS := torchrl-nightly==2026.10.27 tensordict==0.15.3
 
 export MUJOCO_GL ?= egl
 
-.PHONY: demo test check clean
+.PHONY: demo test test-next check clean
 .DELETE_ON_ERROR:
 
 demo: check $(DEMO)/evaluation/.done
@@ -30,13 +33,17 @@ test: check
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(MAKE) test-next
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+test-next: $(NEXT)/.installed
+	$(NEXT)/bin/python -m pytest -q tests/modules tests/objectives torchrl_ocwm/modules torchrl_ocwm/objectives
 
 check: $(INSTALLED)
 	@$(BIN)/python -m torchrl_ocwm.check
 
 clean:
-	rm -rf $(VENV) $(DEMO)
+	rm -rf $(VENV) $(NEXT) $(DEMO)
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@version=$$($(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])'); \
@@ -45,6 +52,14 @@ $(INSTALLED): pyproject.toml constraints.txt
 			"Choose another one: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1 ;; esac
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	@touch $@
+
+# All packages of the other environment, except for those that are newer.
+$(NEXT)/.installed: $(INSTALLED) Makefile
+	$(PYTHON) -m venv --clear $(NEXT)
+	$(NEXT)/bin/pip install --quiet --disable-pip-version-check --no-deps $(NEXT_VERSIONS)
+	$(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))' \
+		> "$$($(NEXT)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/others.pth"
 	@touch $@
 
 $(DEMO)/dataset/.done:

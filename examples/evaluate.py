@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm import load_agent
-from torchrl_ocwm.agents import Agent, Policy, agent_name, describe
+from torchrl_ocwm.agents import Agent, Policy, agent_file, agent_name, describe
 from torchrl_ocwm.data import SmoothRandomPolicy
 from torchrl_ocwm.envs import Task, find_environment, make_scene
 from torchrl_ocwm.evaluation import (
@@ -66,7 +66,8 @@ class Evaluate(Evaluation):
     """Settings of the recipe.
 
     Args:
-        checkpoint: Checkpoint, or list of them: those of one agent count as its seeds, each agent is a row.
+        checkpoint: Checkpoint or trained agent, as ``load_agent`` takes it, or list of them: those of one agent count
+            as its seeds, each agent is a row.
         include: ``results.json`` of earlier evaluations with the same goals and settings, whose rows come first.
         output: Folder for table, numbers, heatmaps, learning curve and video.
     """
@@ -88,7 +89,9 @@ def main(config: Evaluate) -> None:
     settings = config
     if settings.video_goals:
         check_ffmpeg("video_goals")
-    files = [Path(one) for one in ([config.checkpoint] if isinstance(config.checkpoint, str) else config.checkpoint)]
+    files = [
+        agent_file(one) for one in ([config.checkpoint] if isinstance(config.checkpoint, str) else config.checkpoint)
+    ]
     policies = [load_agent(file, behaviour=settings.behaviour) for file in files]
     task, about, output = _one_task(policies, files), policies[0].object_index, Path(config.output)
     goals = task.workspace.grid(settings.grid_size).flatten(0, 1)
@@ -196,7 +199,7 @@ def _evaluate(
 
     episodes = envs.run(policy, goals, images=images, seed=seed, inspect=inspect, progress=True)
     errors = {name: episodes[name].mean(1) for name in ("entity_error", "goal_error") if name in episodes}
-    if "object_position" in policy.agent.model.observed:
+    if "object_position" in policy.agent.model.decoded:
         errors["imagined_distance"] = imagined_distance(
             policy.behaviour,
             episodes["latent"][:, 0],

@@ -30,6 +30,7 @@ REQUIRED = {
     "evaluate": ["checkpoint=a.zip"],
     "diagnose": ["checkpoint=a.zip", "dataset=data"],
     "reproduce": ["figure=table"],
+    "share": ["evaluation=there"],
 }
 
 # A shell that runs the tests in the background lets them, and what they start, ignore Ctrl-C.
@@ -114,7 +115,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def scripts() -> dict[str, ModuleType]:
     """The scripts of the recipes as modules: to run one here saves the seconds that a process takes to start."""
     modules = {}
-    for name in ("collect", "train_offline", "train_online", "evaluate", "diagnose", "reproduce"):
+    for name in ("collect", "train_offline", "train_online", "evaluate", "diagnose", "reproduce", "share"):
         spec = spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
         assert spec is not None
         assert spec.loader is not None

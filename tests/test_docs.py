@@ -54,6 +54,13 @@ def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.Monke
     assert set(vars(module)) > names
 
 
+def test_the_papers_parts_are_where_the_page_says() -> None:
+    names = re.findall(r"`torchrl_ocwm\.(\w+)\.(\w+)`", (ROOT / "docs" / "paper.md").read_text())
+    assert len(names) > 20
+    for room, name in names:
+        assert name in import_module(f"torchrl_ocwm.{room}").__all__, f"torchrl_ocwm.{room} has no {name}"
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_links_lead_somewhere(page: Path) -> None:
     missing = []

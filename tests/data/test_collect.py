@@ -265,7 +265,7 @@ def test_a_policy_has_to_be_handed_in_unless_it_has_a_name(tmp_path, no_collecto
 
 
 def test_unknown_policy(tmp_path, no_collector):
-    with pytest.raises(SettingsError, match="policy must be random, scripted or a checkpoint file, got 'rnd'"):
+    with pytest.raises(SettingsError, match=r"policy must be random, scripted or a trained agent \(rnd: no such"):
         gather(tmp_path / "data", 20, policy="rnd")
 
 

@@ -60,6 +60,7 @@ def test_keys_of_a_rollout(env):
         "object_position": ((1, 2), torch.float32),
         "object_visible": ((1,), torch.bool),
         "goal_position": ((2,), torch.float32),
+        "success": ((1,), torch.bool),
         "is_init": ((1,), torch.bool),
         "reward": ((1,), torch.float32),
         "done": ((1,), torch.bool),

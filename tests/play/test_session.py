@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError
 
-from torchrl_ocwm.agents import AGENTS, Agent, AgentConfig, build_agent, save_agent
+from torchrl_ocwm.agents import AGENTS, Agent, AgentConfig, build_agent, save_agent, shipped_agents
 from torchrl_ocwm.envs import PositioningEnv, make_task, register_environment
 from torchrl_ocwm.evaluation import normalized_score
 from torchrl_ocwm.play import Player, PlayError, Session, Stage, find_players
@@ -428,7 +428,8 @@ def test_who_can_act(make_agent: Callable[..., Agent], tmp_path: Path) -> None:
     file = str(save_agent(make_agent(), tmp_path / "agent.zip"))
     players = find_players([file, "cube_move/scripted", file])
     scripted = ["cube_move/scripted", "reacher/scripted", "shelf_place/scripted", "pick_place/scripted"]
-    assert [player.name for player in players] == [file, *scripted]
+    names = [file, scripted[0], *shipped_agents(), *scripted[1:]]
+    assert [player.name for player in players] == names
     assert [player.environment for player in players][:2] == ["reacher", "cube_move"]
     assert players[0].behaviours() == [("reach (finger)", "reach")]
     with players[0].session() as session:

@@ -85,7 +85,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 @pytest.mark.parametrize(
     ("script", "arguments", "message"),
     [
-        ("collect", "policy=rnd", "SettingsError: policy must be random, scripted or a checkpoint file, got 'rnd'"),
+        ("collect", "policy=rnd", "SettingsError: policy must be random, scripted or a trained agent (rnd: no such"),
         ("collect", "policy={other} dataset=d", "SettingsError: policy={other}: the agent was trained for 'reacher'"),
         ("collect", "dataset={data}", "DatasetError: {data}: holds a dataset of 'reacher' with options {{}}, not of"),
         ("collect", "dataset={results} env.options.horizon=2", "DatasetError: {results}: cannot"),

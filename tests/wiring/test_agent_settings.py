@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl_ocwm.agents import AGENTS, Adam, Agent, DreamerV3, build_agent
 from torchrl_ocwm.agents.checkpoint import CheckpointError, describe, rebuild
 from torchrl_ocwm.envs import Workspace
+from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.testing import STYLES, random_records, reacher_task
 
 # Learning.
@@ -167,6 +168,37 @@ def test_what_is_observed_is_seen_and_nothing_else(row: str) -> None:
             if not torch.equal(states(agent, other), before):
                 seen.add(name)
         assert seen == set(observed)
+
+
+@shows("PositionDistance.unit")
+def test_the_unit_of_a_distance() -> None:
+    """A workspace of 0.48 m is 2 half-widths wide."""
+    metres = make("dreamer_pcp")
+    units = make("dreamer_pcp", {f"{REACH}.reward.unit": "workspace"})
+    units.model.load_state_dict(metres.model.state_dict())
+    half = metres.model.units.metres_per_unit[0]
+    torch.testing.assert_close(reward(metres, latents(metres)), half * reward(units, latents(metres)))
+
+
+@shows("_Observing.predicted")
+@pytest.mark.parametrize("row", ["dreamer_pcp", "focus_pcp", "focus_lcp"])
+def test_what_is_predicted_is_learnt_and_not_seen(row: str) -> None:
+    """The agent acts without it, too."""
+    agent = make(row, {"world_model.observed": ("proprio",), "world_model.predicted": ("object_position",)})
+    records = random_records(TASK, 2, 3)
+    other = records.clone()
+    other["next", "object_position"] += 0.1
+    torch.testing.assert_close(states(agent, other), states(agent, records), rtol=0, atol=0)
+    before, after = (agent.loss.model_loss(one.clone())[0]["loss_model_object_position"] for one in (records, other))
+    assert before != after
+    assert ("next", "object_position") in agent.loss.in_keys
+    assert "object_position" not in agent.policy().in_keys
+    assert "object_position" in make(row).policy().in_keys
+
+
+def test_nothing_is_observed_and_predicted() -> None:
+    with pytest.raises(SettingsError, match="'object_position' is in observed and in predicted"):
+        make("focus", {"world_model.predicted": ("object_position",)})
 
 
 @shows("_Observing.lambda_proprio", "_Observing.lambda_object_position", "_Observing.lambda_goal_position")

@@ -124,3 +124,11 @@ def test_dry_run(reproduce: Callable[..., SimpleNamespace], tmp_path: Path) -> N
 def test_output(reproduce: Callable[..., SimpleNamespace], tmp_path: Path) -> None:
     seen = reproduce("output=there")
     assert seen.root == seen.page[2] == tmp_path / "there"
+
+
+@shows("Share.evaluation", "Share.output", "Share.name")
+def test_share(command: Callable[..., str], scripts: dict[str, ModuleType], monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(scripts["share"], "share", lambda *where, **name: asked.append((*where, name)))
+    command("share", "evaluation=/there", "output=here", "name=a/b")
+    assert asked == [(Path("/there"), Path("here"), {"name": "a/b"})]

@@ -28,6 +28,8 @@ from torchrl_ocwm.agents.rewards import (
     TemporalDistance,
 )
 from torchrl_ocwm.agents.scene import Scene
+from torchrl_ocwm.agents.sources import agent_file, shipped_agents
+from torchrl_ocwm.agents.weights import AgentWeights
 from torchrl_ocwm.agents.world_models import Flat, ObjectCentric, WorldModelPart
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.parts import register
@@ -39,6 +41,7 @@ __all__ = [
     "Adam",
     "Agent",
     "AgentConfig",
+    "AgentWeights",
     "Architecture",
     "Behaviour",
     "Disagreement",
@@ -76,6 +79,7 @@ __all__ = [
     "TemporalDistance",
     "UniformGoalSource",
     "WorldModelPart",
+    "agent_file",
     "agent_name",
     "build_agent",
     "collecting_policy",
@@ -83,4 +87,5 @@ __all__ = [
     "load_agent",
     "register",
     "save_agent",
+    "shipped_agents",
 ]

@@ -39,6 +39,7 @@ class LearntBehaviour(nn.Module):
 
     Attributes:
         actor: Writes ``action`` from ``latent``.
+        reward: Writes the imagined ``reward``.
         imagination: The world model as an environment, with the goal in its state.
         goal: How goals are encoded; ``None`` for a behaviour that sees none.
         loss: The loss.
@@ -55,7 +56,7 @@ class LearntBehaviour(nn.Module):
         _check_goals(config, self.goal)
         reward = config.reward.build(scene, self.goal)
         _check_reward(config, reward, features)
-        self.actor = make_actor(scene, features)
+        self.actor, self.reward = make_actor(scene, features), reward.module
         self.imagination = ImaginationEnv(
             scene.model.transition(),
             reward.module,

@@ -30,7 +30,7 @@ def build_agent(agent: str | AgentConfig, task: Task, size: str | Size = "cpu") 
         >>> from torchrl_ocwm.testing import reacher_task
         >>> agent = build_agent("dreamer_pcp", reacher_task(), size="debug")
         >>> agent.config.behaviours["reach"].reward
-        PositionDistance()
+        PositionDistance(unit='metre')
     """
     return Agent(task, _by_name(agent, AGENTS, "agent"), _by_name(size, SIZES, "size"))
 

@@ -15,6 +15,8 @@ from torchrl_ocwm.agents.agent import Agent, Policy
 from torchrl_ocwm.agents.archive import Archive, read_manifest
 from torchrl_ocwm.agents.config import AgentConfig, Size
 from torchrl_ocwm.agents.presets import flat
+from torchrl_ocwm.agents.sources import agent_file
+from torchrl_ocwm.agents.weights import AgentWeights
 from torchrl_ocwm.data.policies import POLICIES
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.devices import usable_device
@@ -25,7 +27,11 @@ from torchrl_ocwm.settings import Settings, SettingsError, from_dict, to_dict
 
 
 def save_agent(agent: Agent, path: str | Path) -> Path:
-    """Save an agent that was trained in a loop of your own; :func:`load_agent` reads it.
+    """Save what an agent has learnt, without the state of an optimiser; :func:`load_agent` reads it.
+
+    For agents that were trained in a loop of your own, and for trained agents to keep or to share: the names in the
+    file (:class:`~torchrl_ocwm.agents.AgentWeights`) outlast changes of this library, those in the checkpoint of a run
+    need not.
 
     Args:
         agent: The agent.
@@ -46,14 +52,15 @@ def save_agent(agent: Agent, path: str | Path) -> Path:
         >>> policy.agent.config == agent.config
         True
     """
-    return Archive(agent=describe(agent), loss_module=agent.loss).save(path)
+    return Archive(agent=describe(agent), weights=AgentWeights(agent)).save(path)
 
 
 def load_agent(path: str | Path, *, behaviour: str | None = None, device: torch.device | str = "cpu") -> Policy:
     """Load a trained agent's policy from a checkpoint; no dataset and no simulator is needed.
 
     Args:
-        path: A checkpoint that training or :func:`save_agent` wrote.
+        path: A file that training or :func:`save_agent` wrote, a folder with one, the name of a trained agent that
+            comes with this package (``"reacher/focus_lcp"``, :func:`shipped_agents`), or ``"hf://owner/name"``.
         behaviour: Which of the agent's behaviours acts; ``None``: that which acts unless another is asked for.
         device: Where to put it.
 
@@ -65,10 +72,13 @@ def load_agent(path: str | Path, *, behaviour: str | None = None, device: torch.
         CheckpointError: if there is no checkpoint, a damaged one, or not one of an agent of this library.
         DeviceError: if there is no such device.
         ValueError: if there is no such behaviour.
+        MissingPackageError: for ``hf://`` without ``huggingface_hub``.
     """
-    path, device = Path(path), usable_device(device)
+    path, device = agent_file(path), usable_device(device)
     agent = rebuild(read_description(path))
-    Archive(loss_module=agent.loss).load(path, map_location="cpu")
+    lasting = "weights" in read_manifest(path)["components"]
+    kept: dict[str, Any] = {"weights": AgentWeights(agent)} if lasting else {"loss_module": agent.loss}
+    Archive(**kept).load(path, map_location="cpu")
     agent.to(device).eval().requires_grad_(False)
     return agent.policy(behaviour)
 
@@ -89,8 +99,10 @@ def collecting_policy(
     """
     if settings.policy in POLICIES:
         return None
-    if not Path(settings.policy).is_file():
-        raise SettingsError(f"policy must be {', '.join(POLICIES)} or a checkpoint file, got {settings.policy!r}")
+    try:
+        agent_file(settings.policy)
+    except CheckpointError as error:
+        raise SettingsError(f"policy must be {', '.join(POLICIES)} or a trained agent ({error})") from error
     policy, task = load_agent(settings.policy, behaviour=settings.behaviour), make_task(environment, **(options or {}))
     if policy.agent.task != task:
         raise SettingsError(
@@ -171,7 +183,7 @@ def read_description(path: Path) -> dict[str, Any]:
         CheckpointError: if there is no checkpoint, a damaged one, or not one of an agent of this library.
     """
     components = read_manifest(path)["components"]
-    if not {"agent", "loss_module"} <= set(components):
+    if "agent" not in components or not {"loss_module", "weights"} & set(components):
         raise CheckpointError(
             f"{path}: a TorchRL checkpoint, but not of an agent of torchrl_ocwm ({sorted(components)})"
         )

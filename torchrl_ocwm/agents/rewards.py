@@ -20,6 +20,7 @@ from torchrl_ocwm.modules import (
 )
 from torchrl_ocwm.modules import TemporalDistance as DistanceNetwork
 from torchrl_ocwm.modules.networks import make_mlp
+from torchrl_ocwm.modules.rewards import DistanceUnit
 from torchrl_ocwm.objectives import TemporalDistanceLoss
 from torchrl_ocwm.parts import Part, register
 from torchrl_ocwm.settings import SettingsError, setting
@@ -76,11 +77,18 @@ class LearnedReward(Reward):
 @register("position_distance")
 @dataclass(frozen=True)
 class PositionDistance(Reward):
-    """Minus the distance in metres between the decoded position of the object and the goal (paper, equation 3)."""
+    """Minus the distance between the decoded position of the object and the goal (paper, equation 3).
+
+    Args:
+        unit: Metres, or half-widths of the workspace: rewards of order one, for which a two-hot critic has finer bins.
+    """
+
+    unit: DistanceUnit = "metre"
 
     def build(self, scene: Scene, goal: GoalEncoding | None) -> ImaginedReward:
         """The distance, from the decoded positions."""
-        distance = PositionDistanceReward(scene.model.units, object_index=scene.object_index)
+        units = scene.model.units
+        distance = PositionDistanceReward(units, object_index=scene.object_index, unit=self.unit)
         return ImaginedReward(TensorDictSequential(scene.model.object_position(), distance))
 
 

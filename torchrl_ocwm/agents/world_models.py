@@ -43,22 +43,30 @@ class _Observing(WorldModelPart):
 
     Args:
         observed: Vectors that the world model sees and reconstructs, beside the image.
+        predicted: Vectors that it reconstructs without seeing them. An agent acts without them.
         lambda_proprio: Weight of the reconstruction of proprioception.
         lambda_object_position: Weight of the reconstruction of the object positions.
         lambda_goal_position: Weight of the reconstruction of the goal position.
     """
 
     observed: tuple[VectorName, ...] = ("proprio", "object_position")
+    predicted: tuple[VectorName, ...] = ()
     lambda_proprio: float = setting(1.0, at_least=0)
     lambda_object_position: float = setting(200.0, at_least=0)
     lambda_goal_position: float = setting(1.0, at_least=0)
 
     def validate(self) -> None:
-        """A weight of what is not observed does nothing."""
+        """Nothing is named twice, and a weight of what is not reconstructed would do nothing."""
+        if twice := set(self.observed) & set(self.predicted):
+            raise SettingsError(f"{min(twice)!r} is in observed and in predicted; it is reconstructed in either")
         for one in fields(self):
             name = one.name.removeprefix("lambda_")
-            if name != one.name and name not in self.observed and getattr(self, one.name) != one.default:
+            if name != one.name and name not in self._decoded and getattr(self, one.name) != one.default:
                 raise SettingsError(f"{one.name} does nothing: {name!r} is not in observed={self.observed}")
+
+    @property
+    def _decoded(self) -> tuple[VectorName, ...]:
+        return (*self.observed, *self.predicted)
 
     def _arguments(self, task: Task, architecture: Architecture, needs: Mapping[str, Any]) -> dict[str, Any]:
         known = {"reward_head", "positional_encoder" if isinstance(self, ObjectCentric) else "image_latent"}
@@ -71,12 +79,13 @@ class _Observing(WorldModelPart):
             "action": task.action,
             "units": WorkspaceUnits(task.workspace.low, task.workspace.high),
             "observed": self.observed,
+            "predicted": self.predicted,
             "reward_head": "reward_head" in needs,
             "architecture": architecture,
         }
 
     def _weights(self, lambda_dynamic: float) -> dict[str, Any]:
-        names = [f"lambda_{name}" for name in self.observed]  # the weight of anything else would do nothing
+        names = [f"lambda_{name}" for name in self._decoded]  # the weight of anything else would do nothing
         return {"lambda_dynamic": lambda_dynamic, **{name: getattr(self, name) for name in names}}
 
 

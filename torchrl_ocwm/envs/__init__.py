@@ -30,6 +30,7 @@ from torchrl_ocwm.lazy import lazily
 if TYPE_CHECKING:
     from torchrl_ocwm.envs.camera import Camera, Frame
     from torchrl_ocwm.envs.cube_move import CubeMove
+    from torchrl_ocwm.envs.goal_conditioned import GoalConditioned
     from torchrl_ocwm.envs.meta_world import PickPlace, ShelfPlace
     from torchrl_ocwm.envs.positioning import PositioningEnv, SimulationDivergedError
     from torchrl_ocwm.envs.reacher import Reacher
@@ -41,6 +42,7 @@ __all__ = [
     "EnvChoice",
     "EnvOptions",
     "Frame",
+    "GoalConditioned",
     "GoalEnv",
     "MaskToPosition",
     "PickPlace",
@@ -68,6 +70,7 @@ __getattr__ = lazily(
         "Camera": "camera",
         "CubeMove": "cube_move",
         "Frame": "camera",
+        "GoalConditioned": "goal_conditioned",
         "PickPlace": "meta_world",
         "PositioningEnv": "positioning",
         "Reacher": "reacher",

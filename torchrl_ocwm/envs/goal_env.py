@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+import torch
 from tensordict import TensorDictBase
-from torchrl.envs import GymEnv
+from torchrl.data import Binary
+from torchrl.envs import GymEnv, default_info_dict_reader
 
 
 class GoalEnv(GymEnv):
@@ -13,6 +16,8 @@ class GoalEnv(GymEnv):
 
     ``reset(tensordict)`` starts an episode with the ``goal_position`` of the tensordict, if it has one; a goal in
     ``options`` goes before it. Resets inside a rollout draw new goals.
+
+    ``success`` ``[1]`` bool of the environment's info is among the observations; false for one that does not say.
 
     Examples:
         >>> import torch, torchrl_ocwm.envs
@@ -22,6 +27,10 @@ class GoalEnv(GymEnv):
         tensor([ 0.1000, -0.2000])
         >>> env.close()
     """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.set_info_dict_reader(_Success())
 
     def _make_specs(self, env: Any, batch_size: Any = None) -> None:
         super()._make_specs(env, batch_size)
@@ -33,3 +42,12 @@ class GoalEnv(GymEnv):
         if goal is not None:
             kwargs["options"] = {"goal_position": goal.numpy(force=True), **(kwargs.get("options") or {})}
         return super()._reset(tensordict, **kwargs)
+
+
+class _Success(default_info_dict_reader):
+    def __init__(self) -> None:
+        super().__init__(["success"], {"success": Binary(1, (1,), dtype=torch.bool)})
+
+    def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
+        success = np.array([bool(info_dict.get("success", False))])
+        return super().__call__({"success": success}, tensordict)

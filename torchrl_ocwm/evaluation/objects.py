@@ -39,7 +39,7 @@ def object_errors(model: RSSMWorldModel, records: TensorDictBase, context: int) 
     }
     future, masks = records[:, context:], instance_masks(records["next", "masks"])[..., :-1, :, :]
     errors: dict[str, dict[str, Tensor]] = {name: {} for name in (*views, "unmoved")}
-    if "object_position" in model.observed:
+    if "object_position" in model.decoded:
         errors = {name: quartiles(position_error(model, latents, future)) for name, latents in views.items()}
         errors["unmoved"] = quartiles(unmoved_error(records, context)[:, context:])
     if isinstance(model, ObjectWorldModel):

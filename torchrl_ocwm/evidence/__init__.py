@@ -11,6 +11,7 @@ from torchrl_ocwm.evidence.queue import RunFailedError, in_order, work_off
 from torchrl_ocwm.evidence.records import Record, RecordError
 from torchrl_ocwm.evidence.runs import Collected, Evaluated, Explored, Run, Trained
 from torchrl_ocwm.evidence.settings import Evidence, Machine
+from torchrl_ocwm.evidence.share import share
 
 __all__ = [
     "BUDGETS",
@@ -37,6 +38,7 @@ __all__ = [
     "forecast",
     "in_order",
     "results",
+    "share",
     "table",
     "work_off",
     "write_page",

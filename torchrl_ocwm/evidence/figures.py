@@ -111,9 +111,14 @@ def _both(agent: str, **more: Any) -> tuple[Row, ...]:
 
 #: Also where random actions are measured, so that figures share that too.
 _LCP = Row(name="focus_lcp", agent="focus_lcp", image_goals=True, random=True)
+_PCP = Row(name="dreamer_pcp", agent="dreamer_pcp")
+_GOALS = "behaviours.reach.goals"
+_UNSEEN = {"world_model.observed": ["proprio"], "world_model.predicted": ["object_position"]}
+_IN_UNITS = {"behaviours.reach.reward.unit": "workspace"}
+_PAPERS_LCP = {"behaviours.reach.goal.weight": 1, "behaviours.reach.reward": "latent_similarity"}
 _TABLE = (
     *_both("dreamer"),
-    Row(name="dreamer_pcp", agent="dreamer_pcp"),
+    _PCP,
     *_both("focus"),
     Row(name="focus_pcp", agent="focus_pcp"),
     _LCP,
@@ -183,6 +188,18 @@ FIGURES = {
             Row(name="lexa_cosine", agent="lexa_cosine"),
             Row(name="lexa_temporal", agent="lexa_temporal"),
             _LCP,
+        ),
+        draws=("heatmap", "curves"),
+    ),
+    "fairness": Figure(
+        title="What departures from the paper do for PCP and LCP",
+        rows=(
+            _PCP,
+            Row(name="dreamer_pcp, position not observed", agent="dreamer_pcp", changes=_UNSEEN),
+            Row(name="dreamer_pcp, goals that the data shows", agent="dreamer_pcp", changes={_GOALS: "frames"}),
+            Row(name="dreamer_pcp, reward in workspace units", agent="dreamer_pcp", changes=_IN_UNITS),
+            _LCP,
+            Row(name="focus_lcp, cosine and weight 1", agent="focus_lcp", changes=_PAPERS_LCP, image_goals=True),
         ),
         draws=("heatmap", "curves"),
     ),

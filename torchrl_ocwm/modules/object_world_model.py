@@ -25,12 +25,13 @@ class ObjectWorldModel(RSSMWorldModel):
         image_size: Height and width of the images, pixels.
         objects: Number of objects O; the background is one instance more.
         observed: Vectors that the encoder sees.
+        predicted: Vectors that are decoded beside these, though it does not see them.
         positional_encoder: Whether to learn the latent of an object at a position (LCP).
         architecture: Shapes of the networks.
         kwargs: The other arguments of :class:`~torchrl_ocwm.modules.RSSMWorldModel`.
 
     Raises:
-        SettingsError: if the object positions are not observed.
+        SettingsError: if the object positions are neither observed nor predicted.
 
     Examples:
         >>> from torchrl_ocwm.testing import random_records, reacher_task
@@ -47,19 +48,22 @@ class ObjectWorldModel(RSSMWorldModel):
         image_size: int,
         objects: int,
         observed: tuple[VectorName, ...],
+        predicted: tuple[VectorName, ...] = (),
         positional_encoder: bool,
         architecture: Architecture,
         **kwargs: Any,
     ) -> None:
-        if "object_position" not in observed:
+        if "object_position" not in (*observed, *predicted):
             raise SettingsError(
-                "an object-centric world model learns from object positions: 'object_position' in `observed`"
+                "an object-centric world model learns from object positions: 'object_position' in `observed`, or in "
+                "`predicted`"
             )
         super().__init__(
             image_size=image_size,
             objects=objects,
             observed=observed,
-            decoded=tuple(name for name in observed if name != "object_position"),
+            predicted=predicted,
+            of_scene=tuple(name for name in (*observed, *predicted) if name != "object_position"),
             architecture=architecture,
             **kwargs,
         )

@@ -33,23 +33,34 @@ def position_distance(position: Tensor, goal: Tensor, epsilon: float = 1e-6) -> 
     return -(position - goal).square().sum(-1, keepdim=True).clamp_min(epsilon**2).sqrt()
 
 
+#: What a distance is measured in: metres, or half-widths of the workspace.
+DistanceUnit = Literal["metre", "workspace"]
+
+
 class PositionDistance(nn.Module):
-    """:func:`position_distance` of one object, from workspace units to metres.
+    """:func:`position_distance` of one object, of positions in workspace units.
 
     Args:
         units: Workspace units of both positions.
         object_index: Which object is to be positioned.
+        unit: What the distance is measured in.
 
-    Called with positions ``[..., O * D]`` and goals ``[..., D]``, both in workspace units; returns ``[..., 1]`` metres.
+    Called with positions ``[..., O * D]`` and goals ``[..., D]``, both in workspace units; returns ``[..., 1]``.
+
+    Raises:
+        ValueError: for another unit.
     """
 
-    def __init__(self, units: WorkspaceUnits, object_index: int = 0) -> None:
+    def __init__(self, units: WorkspaceUnits, object_index: int = 0, unit: DistanceUnit = "metre") -> None:
         super().__init__()
-        self.units, self.object_index = units, object_index
+        read(DistanceUnit, unit, "unit")
+        self.units, self.object_index, self.unit = units, object_index, unit
 
     def forward(self, positions: Tensor, goal: Tensor) -> Tensor:
         """The reward ``[..., 1]`` for positions of all objects ``[..., O * D]`` and goals ``[..., D]``."""
         position = positions.unflatten(-1, (-1, self.units.dim))[..., self.object_index, :]
+        if self.unit == "workspace":
+            return position_distance(position, goal)
         return position_distance(self.units.to_metres(position), self.units.to_metres(goal))  # Eq. 3
 
 
@@ -161,16 +172,17 @@ class _FullLatentSimilarity(nn.Module):
 
 
 class PositionDistanceReward(TensorDictModule):
-    """The negative distance in metres between the decoded position of an object and the goal position.
+    """The negative distance between the decoded position of an object and the goal position.
 
     Reward of the position-conditioned policy (paper, equation 3).
 
     Args:
         units: Workspace units of both positions.
         object_index: Which object is to be positioned.
+        unit: Whether it is in metres, or in half-widths of the workspace.
         position_key: Decoded positions, ``[..., O * D]`` in workspace units.
         goal_key: Goal position, ``[..., D]`` in workspace units.
-        reward_key: Key written, ``[..., 1]`` metres.
+        reward_key: Key written, ``[..., 1]``.
 
     Examples:
         >>> import torch
@@ -186,9 +198,10 @@ class PositionDistanceReward(TensorDictModule):
         units: WorkspaceUnits,
         *,
         object_index: int = 0,
+        unit: DistanceUnit = "metre",
         position_key: NestedKey = "object_units",
         goal_key: NestedKey = ("latent", "goal"),
         reward_key: NestedKey = "reward",
     ) -> None:
-        distance = PositionDistance(units, object_index)
+        distance = PositionDistance(units, object_index, unit)
         super().__init__(distance, in_keys=[position_key, goal_key], out_keys=[reward_key])

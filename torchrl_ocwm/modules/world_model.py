@@ -40,7 +40,8 @@ class RSSMWorldModel(nn.Module, ABC):
         action: Number of actions A.
         units: Workspace units of the positions.
         observed: Vectors that the encoder sees.
-        decoded: Those of them that are decoded from the latent of the scene.
+        predicted: Vectors that are decoded beside these, though it does not see them.
+        of_scene: Those of both that are decoded from the latent of the scene.
         reward_head: Whether to predict the reward.
         architecture: Shapes of the networks.
     """
@@ -54,20 +55,20 @@ class RSSMWorldModel(nn.Module, ABC):
         action: int,
         units: WorkspaceUnits,
         observed: tuple[VectorName, ...],
-        decoded: tuple[VectorName, ...],
+        predicted: tuple[VectorName, ...] = (),
+        of_scene: tuple[VectorName, ...],
         reward_head: bool,
         architecture: Architecture,
     ) -> None:
         super().__init__()
         self.action, self.belief = action, architecture.belief
         self.state = architecture.categoricals * architecture.classes
-        self.units, self.observed = units, tuple(observed)
-        sizes = {"proprio": proprio, "object_position": objects * units.dim, "goal_position": units.dim}
-        vectors = {name: sizes[name] for name in self.observed}
+        self.units, self.observed, self.decoded = units, tuple(observed), (*observed, *predicted)
+        vectors = {"proprio": proprio, "object_position": objects * units.dim, "goal_position": units.dim}
         mlp = partial(make_mlp, in_features=self.latent_features, **architecture.mlp)
-        self.encoder = ObservationEncoder(image_size, sum(vectors.values()), architecture)
+        self.encoder = ObservationEncoder(image_size, sum(vectors[name] for name in observed), architecture)
         self.prior, self.posterior = make_rssm(architecture, action=action, embedding=self.encoder.features)
-        self.vector_decoders = nn.ModuleDict({name: mlp(out_features=vectors[name]) for name in decoded})
+        self.vector_decoders = nn.ModuleDict({name: mlp(out_features=vectors[name]) for name in of_scene})
         self.continue_head = mlp(out_features=1, layers=1)
         self.two_hot = SymExpTwoHot()
         self.reward_head = mlp(out_features=self.two_hot.num_bins, outscale=0.0) if reward_head else None
@@ -99,7 +100,7 @@ class RSSMWorldModel(nn.Module, ABC):
         rollout.in_keys = [*rollout.in_keys, "is_init"]  # TorchRL's takes it as optional: then memory crosses episodes
         return TensorDictSequential(
             InitialLatent(self.state, self.belief),
-            *self._encode("next"),
+            *self._encode("next", in_units=self.decoded),
             rollout,
             *self.decoders("next"),
         )
@@ -133,13 +134,13 @@ class RSSMWorldModel(nn.Module, ABC):
             for name, decoder in self.vector_decoders.items()
         ]
 
-    def _encode(self, *at: str) -> list[TensorDictModuleBase]:
-        """Positions to workspace units, then all that is observed to ``encoded_latents``."""
-        modules: list[TensorDictModuleBase] = []
-        if "object_position" in self.observed:
+    def _encode(self, *at: str, in_units: tuple[VectorName, ...] = ()) -> list[TensorDictModuleBase]:
+        """Positions to workspace units (``in_units``: others too), then what is observed to ``encoded_latents``."""
+        modules, in_units = list[TensorDictModuleBase](), in_units or self.observed
+        if "object_position" in in_units:
             flatten = _ObjectUnits(self.units)
             modules.append(TensorDictModule(flatten, [key_at(at, "object_position")], [key_at(at, "object_units")]))
-        if "goal_position" in self.observed:
+        if "goal_position" in in_units:
             modules.append(TensorDictModule(self.units, [key_at(at, "goal_position")], [key_at(at, "goal_units")]))
         inputs = [key_at(at, "pixels"), *(key_at(at, _KEYS[name]) for name in self.observed)]
         return [*modules, TensorDictModule(self.encoder, inputs, [key_at(at, "encoded_latents")])]
@@ -200,6 +201,7 @@ class FlatWorldModel(RSSMWorldModel):
     Args:
         image_size: Height and width of the images, pixels.
         observed: Vectors that the encoder sees and the decoder reconstructs.
+        predicted: Vectors that the decoder reconstructs, and the encoder does not see.
         architecture: Shapes of the networks.
         image_latent: Whether the latents of images alone are learnt, which are goals then.
         kwargs: The other arguments of :class:`RSSMWorldModel`.
@@ -218,12 +220,14 @@ class FlatWorldModel(RSSMWorldModel):
         *,
         image_size: int,
         observed: tuple[VectorName, ...],
+        predicted: tuple[VectorName, ...] = (),
         architecture: Architecture,
         image_latent: bool = False,
         **kwargs: Any,
     ) -> None:
-        scene: dict[str, Any] = {"image_size": image_size, "observed": observed, "architecture": architecture}
-        super().__init__(decoded=observed, **scene, **kwargs)
+        scene: dict[str, Any] = {"image_size": image_size, "architecture": architecture}
+        vectors: dict[str, Any] = {"observed": observed, "predicted": predicted, "of_scene": (*observed, *predicted)}
+        super().__init__(**vectors, **scene, **kwargs)
         self.image_decoder = make_image_decoder(architecture, self.latent_features, image_size)
         self.image_latent = image_latent
 
@@ -263,7 +267,7 @@ class FlatWorldModel(RSSMWorldModel):
         """
         if "object_position" not in self.vector_decoders:
             raise SettingsError(
-                "this world model does not decode object positions; add 'object_position' to `observed`"
+                "this world model does not decode object positions; add 'object_position' to `observed` or `predicted`"
             )
         return TensorDictModule(self.vector_decoders["object_position"], latent_at(("latent",)), ["object_units"])
 

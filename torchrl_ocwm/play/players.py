@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from torchrl_ocwm.agents import Agent, load_agent
+from torchrl_ocwm.agents import Agent, load_agent, shipped_agents
 from torchrl_ocwm.envs import ENVIRONMENTS
 from torchrl_ocwm.envs.registry import not_installed
 from torchrl_ocwm.play.session import Session
@@ -45,7 +45,9 @@ class Player(NamedTuple):
 
 
 def find_players(agents: Sequence[str], behaviour: str | None = None) -> list[Player]:
-    """The agents, and the scripted policies of all environments whose simulators are installed.
+    """The agents, those that come with this package, and the scripted policies of the environments.
+
+    Environments whose simulators are not installed are left out, but for those of the given agents.
 
     Args:
         agents: What :func:`~torchrl_ocwm.load_agent` takes, or the name of an environment and ``/scripted``.
@@ -55,12 +57,14 @@ def find_players(agents: Sequence[str], behaviour: str | None = None) -> list[Pl
         CheckpointError: for one that cannot be loaded.
 
     Examples:
-        >>> [player.name for player in find_players(["cube_move/scripted"])][:2]
-        ['cube_move/scripted', 'reacher/scripted']
+        >>> find_players(["cube_move/scripted"])[0]
+        Player(name='cube_move/scripted', environment='cube_move', agent=None, acting=None)
     """
-    scripted = [f"{name}{SCRIPTED}" for name, one in ENVIRONMENTS.items() if not_installed(one) is None]
+    installed = [name for name, one in ENVIRONMENTS.items() if not_installed(one) is None]
+    scripted = [f"{name}{SCRIPTED}" for name in installed]
+    shipped = [name for name in shipped_agents() if name.partition("/")[0] in installed]
     players = []
-    for number, name in enumerate(dict.fromkeys([*agents, *scripted])):
+    for number, name in enumerate(dict.fromkeys([*agents, *shipped, *scripted])):
         if name in scripted:
             players.append(Player(name, name.removesuffix(SCRIPTED)))
         else:

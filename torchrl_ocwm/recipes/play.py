@@ -16,9 +16,11 @@ class Play(Settings):
     """Settings of the recipe.
 
     Args:
-        agent: Who acts: a checkpoint, or an environment with ``/scripted`` for its scripted policy.
+        agent: Who acts: a checkpoint, a folder with one, the name of an agent that comes with this package, such as
+            ``reacher/focus_lcp``, or an environment with ``/scripted`` for its scripted policy.
         behaviour: Which of the agent's behaviours acts; ``null``: that which acts unless another is asked for.
-        others: More of them, to choose from on the page. The scripted policies are there anyway.
+        others: More of them, to choose from on the page. Those that come with this package, and the scripted policies,
+            are there anyway.
         host: Address to listen at: this machine only, or ``0.0.0.0`` for all who reach it; they can steer too.
         port: Port; ``null``: the first free one from 7860.
         browser: Open the page in the browser of this machine.

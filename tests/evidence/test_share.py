@@ -1,0 +1,83 @@
+"""Trained agents for others."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchrl_ocwm import load_agent, save_agent
+from torchrl_ocwm.agents import build_agent
+from torchrl_ocwm.envs import make_task
+from torchrl_ocwm.evaluation import Report
+from torchrl_ocwm.evidence import Collected, Evaluated, Record, RecordError, Trained, share
+
+
+@pytest.fixture
+def evaluated(tmp_path: Path) -> Path:
+    """An evaluation of a tiny agent as ``reproduce`` leaves it, and its training."""
+    data = Collected(env="reacher", options={"image_size": 16}, policies={"scripted": 30, "random": 12})
+    trained = Trained(data=data, agent="dreamer_pcp", size="debug", seed=3, updates=1_200)
+    run = Evaluated(trained=trained, goals=1, episode_steps=7)
+    agent = build_agent("dreamer_pcp", make_task("reacher", image_size=16), "debug")
+    root = tmp_path / "runs"
+    save_agent(agent, root / trained.name / "checkpoint.zip")
+    for one, commit in ((trained, "abc"), (run, "def")):
+        (root / one.name).mkdir(parents=True, exist_ok=True)
+        record = Record.of(one, root)
+        replace(record, done=True, seconds=180.0, commit=commit, machine="a fast one, 2 cores").write(root / one.name)
+    report = Report(torch.zeros(1, 2), {"goals": 1, "episode_steps": 7})
+    report.add("dreamer_pcp", {"final_score": torch.tensor([0.75])}, source="elsewhere")
+    report.save(root / run.name)
+    return root / run.name
+
+
+def test_agent_and_card(evaluated: Path, tmp_path: Path) -> None:
+    folder = share(evaluated, tmp_path / "shared", name="reacher/dreamer_pcp")
+    there = load_agent(next((evaluated.parents[1] / "trainings").iterdir()))
+    for (name, ours), theirs in zip(load_agent(folder).named_parameters(), there.parameters(), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=0, msg=name)
+    card = (folder / "README.md").read_text()
+    assert card.startswith("---\nlibrary_name: torchrl_ocwm\n")
+    assert 'load_agent("reacher/dreamer_pcp")' in card
+    assert "30 scripted steps and 12 random steps, seed 0" in card
+    assert "1,200 updates, seed 3, 3 min" in card
+    assert "a fast one, 2 cores" in card
+    assert "| commit | abc |" in card
+    assert "1 goals on a grid over the workspace, 7 steps each" in card
+    assert "evaluated at commit def" in card
+    assert "| dreamer_pcp | 1 | 0.75 |" in card
+
+
+def test_runs_may_have_been_moved(evaluated: Path, tmp_path: Path) -> None:
+    shutil.move(tmp_path / "runs", tmp_path / "moved")
+    share(tmp_path / "moved" / "evaluations" / evaluated.name, tmp_path / "shared")
+    assert (tmp_path / "shared" / "agent.zip").exists()
+
+
+def test_an_evaluation_that_is_not_done(evaluated: Path, tmp_path: Path) -> None:
+    replace(Record.read(evaluated / "run.json"), done=False).write(evaluated)
+    with pytest.raises(RecordError, match="not an evaluation that is done"):
+        share(evaluated, tmp_path / "shared")
+    assert not (tmp_path / "shared").exists()
+
+
+def test_a_training_is_no_evaluation(evaluated: Path, tmp_path: Path) -> None:
+    with pytest.raises(RecordError, match="not an evaluation that is done"):
+        share(next((evaluated.parents[1] / "trainings").iterdir()), tmp_path / "shared")
+
+
+def test_an_evaluation_without_its_training(evaluated: Path, tmp_path: Path) -> None:
+    shutil.rmtree(evaluated.parents[1] / "trainings")
+    with pytest.raises(RecordError, match="its training is not in"):
+        share(evaluated, tmp_path / "shared")
+
+
+def test_the_recipe(evaluated: Path, tmp_path: Path, command: Callable[..., str]) -> None:
+    assert str(tmp_path / "new") in command("share", f"evaluation={evaluated}", f"output={tmp_path}/new", "name=a/b")
+    assert "# a/b" in (tmp_path / "new" / "README.md").read_text()
+    assert "not the record of a run" in command("share", f"evaluation={tmp_path}")
