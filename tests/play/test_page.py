@@ -178,6 +178,7 @@ def test_it_is_served_to_this_machine_and_asks_nobody(page: Page, local_only: li
         assert page.blocks.server_name == "127.0.0.1"
     finally:
         page.close()
+    assert page.blocks.stylesheets == []  # of fonts
     assert page.blocks.analytics_enabled is False
     assert page.blocks.share is False
     assert not re.findall(r"<(?:script|link|img)[^>]*(?:src|href)=.?https?:", html)
