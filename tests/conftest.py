@@ -32,7 +32,7 @@ REQUIRED = {
     "reproduce": ["figure=table"],
     "share": ["evaluation=there"],
     "import_data": ["source=there"],
-    "export_data": ["dataset=data", "destination=out"],
+    "export_data": ["dataset=data", "format=npz", "destination=out"],
 }
 
 # A shell that runs the tests in the background lets them, and what they start, ignore Ctrl-C.

@@ -64,6 +64,13 @@ def test_one_render_gives_colours_segments_and_depth(open_camera, data):
     assert (frame.depth.shape, frame.depth.dtype) == ((HEIGHT, WIDTH), np.float32)
 
 
+def test_a_picture_is_the_colours_alone(open_camera, data):
+    camera = open_camera("tilted")
+    picture = camera.picture(data)
+    assert np.array_equal(picture, camera.render(data).pixels)
+    assert picture.std() > 1
+
+
 def test_segments_are_where_the_geoms_are(open_camera, data):
     geoms = open_camera().render(data).geoms
     assert geoms[pixel_of(-0.4, 0.3, 0.3)] == BOX

@@ -139,6 +139,16 @@ class Camera:
             data: A state of the camera's model.
             depth: Read the depth too; it comes out of the segmentation pass.
         """
+        pixels = self.picture(data)
+        flags = self._scene.flags
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
+        mujoco.mjr_render(self._fine, self._scene, self._context)
+        mujoco.mjr_readPixels(self._ids, self._depth if depth else None, self._fine, self._context)
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
+        return Frame(pixels, self._geoms(), self._metres() if depth else None)
+
+    def picture(self, data: mujoco.MjData) -> np.ndarray:
+        """Render the colours alone, ``[H, W, 3]`` uint8: the first pass of :meth:`render`."""
         if self._context is None:
             raise RuntimeError("this camera is closed")
         self._make_current()
@@ -148,14 +158,7 @@ class Camera:
             raise ValueError(f"the scene has more than {self._max_geoms} geoms; give the camera a larger max_geoms")
         mujoco.mjr_render(self._rectangle, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._rectangle, self._context)
-
-        flags = self._scene.flags
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
-        mujoco.mjr_render(self._fine, self._scene, self._context)
-        mujoco.mjr_readPixels(self._ids, self._depth if depth else None, self._fine, self._context)
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
-        # OpenGL's rows run upwards.
-        return Frame(self._pixels[::-1].copy(), self._geoms(), self._metres() if depth else None)
+        return self._pixels[::-1].copy()  # OpenGL's rows run upwards
 
     def _make_current(self) -> None:
         if threading.current_thread() is not self._thread:

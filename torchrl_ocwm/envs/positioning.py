@@ -266,6 +266,56 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
 
     # Goals and observations.
 
+    @property
+    def goal_position(self) -> np.ndarray:
+        """The goal of the running episode, (D,) float32 metres."""
+        return self._goal.copy()
+
+    def set_goal(self, goal_position: np.ndarray | Sequence[float]) -> Observation:
+        """Give the running episode another goal (D,), metres; what is seen with it.
+
+        Raises:
+            ValueError: for a goal outside the workspace.
+        """
+        self._check_open()
+        self._goal = self._check_goal(goal_position)
+        return self._observe(self.data)
+
+    def move_object(self, position: np.ndarray | Sequence[float], object_index: int = 0) -> Observation:
+        """Disturb the running episode: put an object somewhere else; what is seen then.
+
+        An object that moves freely keeps its turn, and its coordinates on other axes. What is part of a robot is
+        brought there with it, or as near as can be.
+
+        Args:
+            position: (D,) metres, in the workspace.
+            object_index: Which object.
+
+        Raises:
+            ValueError: for a position outside the workspace, or an object that there is not.
+        """
+        self._check_open()
+        place = self._check_goal(position)
+        self._check_object(object_index)
+        joint = self._free_joint(object_index)
+        if joint is None:
+            self._teleport(self.data, place, object_index)
+        else:
+            moved = place - self._relative(self._true_position(self.data))[object_index]
+            address, speed = self.model.jnt_qposadr[joint], self.model.jnt_dofadr[joint]
+            self.data.qpos[address + np.array(self._axes)] += moved
+            self.data.qvel[speed : speed + 6] = 0
+        mujoco.mj_forward(self.model, self.data)
+        observation = self._observe(self.data)
+        self._last_seen = observation["object_position"]
+        return observation
+
+    def _free_joint(self, object_index: int) -> int | None:
+        """The joint that lets an object move in all directions, if it has one."""
+        body = self.model.body_rootid[self.model.geom_bodyid[self._geom_ids[object_index][0]]]
+        joint = self.model.body_jntadr[body]
+        return joint if joint >= 0 and self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE else None
+
     def goal_observation(self, goal_position: np.ndarray, object_index: int = 0) -> Observation:
         """What would be seen with an object at a goal; the running episode is not touched.
 
@@ -278,10 +328,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         """
         self._check_open()
         goal = self._check_goal(goal_position)
-        if not 0 <= object_index < len(self.objects):
-            raise ValueError(
-                f"object_index must be below {len(self.objects)}, the number of objects; got {object_index}"
-            )
+        self._check_object(object_index)
         if self._scratch is None:
             self._scratch = mujoco.MjData(self.model)
         full = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -297,6 +344,12 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         if goal.shape != (self.workspace.dim,):
             raise ValueError(f"one goal position of shape ({self.workspace.dim},) is needed, got {tuple(goal.shape)}")
         return goal.numpy()
+
+    def _check_object(self, object_index: int) -> None:
+        if not 0 <= object_index < len(self.objects):
+            raise ValueError(
+                f"object_index must be below {len(self.objects)}, the number of objects; got {object_index}"
+            )
 
     def _observation_space(self) -> spaces.Dict:
         size, objects, dim = self.image_size, len(self.objects), self.workspace.dim
@@ -386,6 +439,32 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     def project(self, position: np.ndarray) -> np.ndarray:
         """Where a position (..., D), metres from the start, appears in the image: (..., 2) as (column, row)."""
         return self._project(position, self.data)
+
+    def unproject(self, point: np.ndarray | Sequence[float], height: float = 0.0) -> np.ndarray:
+        """Which position (..., D), metres from the start, appears at a point (..., 2) of the image, (column, row).
+
+        The inverse of :meth:`project`. Positions with two axes lie in the plane of these axes through the start;
+        those with three lie in a horizontal plane.
+
+        Args:
+            point: (..., 2) pixels.
+            height: Of that plane above the start, metres; for positions with three axes.
+
+        Raises:
+            ValueError: for a point where the camera does not see the plane.
+        """
+        self._check_open()
+        pose, point = self.camera.extrinsics(self.data).astype(np.float64), np.asarray(point, np.float64)
+        pixels = np.concatenate([point, np.ones((*point.shape[:-1], 1))], -1)
+        rays = pixels @ np.linalg.inv(self._intrinsics.numpy().astype(np.float64)).T @ pose[:3, :3].T
+        across = 2 if len(self._axes) == 3 else ({0, 1, 2} - set(self._axes)).pop()
+        level = self._start[across] + (height if len(self._axes) == 3 else 0.0) - pose[across, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = level / rays[..., across]
+        if not (np.isfinite(far) & (far > 0)).all():
+            raise ValueError(f"the camera does not see the plane of the goals at {point.tolist()} (column, row)")
+        world = pose[:3, 3] + far[..., None] * rays
+        return (world - self._start)[..., self._axes].astype(np.float32)
 
     def _project(self, position: np.ndarray, data: mujoco.MjData) -> np.ndarray:
         world = np.broadcast_to(self._start, (*position.shape[:-1], 3)).copy()
