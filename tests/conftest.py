@@ -31,6 +31,8 @@ REQUIRED = {
     "diagnose": ["checkpoint=a.zip", "dataset=data"],
     "reproduce": ["figure=table"],
     "share": ["evaluation=there"],
+    "import_data": ["source=there"],
+    "export_data": ["dataset=data", "format=npz", "destination=out"],
 }
 
 # A shell that runs the tests in the background lets them, and what they start, ignore Ctrl-C.

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -65,6 +66,29 @@ def test_help_loads_neither_torch_nor_hydra() -> None:
 
 def test_the_words_after_a_command_are_its_recipes(called: Callable[..., list[list[str]]]) -> None:
     assert called("train", "agent=focus", "--help") == [["train", "agent=focus", "--help"]]
+
+
+@pytest.mark.parametrize(
+    ("typed", "seen"),
+    [
+        (("play", "reacher/focus_lcp", "port=1"), ["agent='reacher/focus_lcp'", "port=1"]),
+        (("play", "hf://it's/one"), ["agent='hf://it\\'s/one'"]),
+        (("play", "agent=a"), ["agent=a"]),
+        (("play", "--help"), ["--help"]),
+        (("play",), []),
+        (("evaluate", "reacher/focus_lcp", "goals=9"), ["checkpoint='reacher/focus_lcp'", "goals=9"]),
+        (("collect", "reacher"), ["reacher"]),
+    ],
+)
+def test_a_first_word_that_is_no_setting(
+    typed: tuple[str, ...], seen: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments: list[str] = []
+    recipe = SimpleNamespace(main=lambda: arguments.extend(sys.argv[1:]))
+    monkeypatch.setattr(console, "import_module", lambda name: recipe)
+    monkeypatch.setattr(sys, "argv", ["ocwm", *typed])
+    console.main()
+    assert arguments == seen
 
 
 def test_completion_is_installed_without_torch() -> None:

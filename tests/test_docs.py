@@ -16,9 +16,9 @@ import pytest
 import torchrl_ocwm
 from torchrl_ocwm.agents import AGENTS, AgentConfig, Size
 from torchrl_ocwm.agents.checkpoint import Description
-from torchrl_ocwm.envs import ENVIRONMENTS, Task, Workspace
+from torchrl_ocwm.envs import ENVIRONMENTS, ActionRange, Task, Workspace
 from torchrl_ocwm.envs.options import EnvOptions
-from torchrl_ocwm.envs.registry import EnvChoice
+from torchrl_ocwm.envs.registry import EnvChoice, RecordedEnv
 from torchrl_ocwm.parts import Part
 from torchrl_ocwm.settings import Settings
 
@@ -91,7 +91,7 @@ def test_every_settings_class_has_a_table() -> None:
     assert {"agents", "options", "sizes architecture", "sizes learning"} <= tables
     assert parts == set(Part.registered)
     # They hold others, are shown otherwise, or are what datasets and checkpoints keep.
-    others = {AgentConfig, Description, EnvChoice, Size, Task, Workspace}
+    others = {ActionRange, AgentConfig, Description, EnvChoice, RecordedEnv, Size, Task, Workspace}
     lacking = [
         kind.__name__
         for kind in subclasses(Settings)

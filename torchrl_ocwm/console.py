@@ -16,11 +16,16 @@ COMMANDS = {
     "collect": ("collect", "Collect a dataset."),
     "train": ("train_offline", "Train an agent on a dataset."),
     "train-online": ("train_online", "Train an agent that collects its data."),
+    "import": ("import_data", "Make a dataset of recordings in the formats of others."),
+    "export": ("export_data", "Write a dataset in a format of others."),
     "evaluate": ("evaluate", "Score agents on a grid of goals; tables, pictures, videos."),
     "diagnose": ("diagnose", "Look into a world model: masks, positions, goal latents."),
     "reproduce": ("reproduce", "Make a table or figure of the paper, from nothing."),
+    "play": ("play", "A page in the browser: click a goal, watch an agent and what it imagines."),
     "share": ("share", "Make a trained agent ready for others."),
 }
+#: Commands whose first word may be the value of a setting: ``ocwm play reacher/focus_lcp``.
+FIRST_WORDS = {"evaluate": "checkpoint", "play": "agent"}
 _HELP, _COMPLETION = ("-h", "--help"), ("-sc", "--shell-completion")
 
 
@@ -44,6 +49,9 @@ def run(command: str) -> None:
     Raises:
         SystemExit: with one line, if the extra ``recipes`` is not installed.
     """
+    if command in FIRST_WORDS and (word := next(iter(sys.argv[1:]), "-")) and not _is_setting(word):
+        quoted = word.replace("'", "\\'")
+        sys.argv[1] = f"{FIRST_WORDS[command]}='{quoted}'"
     try:
         recipe = import_module(f"torchrl_ocwm.recipes.{COMMANDS[command][0]}")
     except UserError as error:
@@ -76,6 +84,10 @@ def help_text() -> str:
             "",
         ]
     )
+
+
+def _is_setting(word: str) -> bool:
+    return word.startswith(("-", "+", "~")) or "=" in word
 
 
 def _complete(arguments: list[str]) -> None:

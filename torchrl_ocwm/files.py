@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from filelock import FileLock, Timeout
 
@@ -48,6 +49,35 @@ def replacing(path: str | Path) -> Iterator[Path]:
     except BaseException:
         new.unlink(missing_ok=True)
         raise
+    sync(path.parent)
+
+
+@contextmanager
+def whole_folder(path: str | Path) -> Iterator[Path]:
+    """Make a folder beside its place, and put it there in one step when it is whole.
+
+    Args:
+        path: The folder, which does not exist or is empty. What is written goes to the path that is yielded, which does
+            not exist yet. Nothing of it stays if anything fails.
+
+    Raises:
+        OSError: if it cannot be written.
+
+    Examples:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp()) / "a"
+        >>> with whole_folder(folder) as new:
+        ...     (new / "b").mkdir(parents=True)
+        >>> [str(file.relative_to(folder.parent)) for file in sorted(folder.parent.rglob("*"))]
+        ['a', 'a/b']
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as beside:
+        yield Path(beside, "new")
+        if path.exists():
+            path.rmdir()
+        os.replace(Path(beside, "new"), path)
     sync(path.parent)
 
 

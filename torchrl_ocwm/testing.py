@@ -6,10 +6,12 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict
+from torch.nn.functional import one_hot
 
 from torchrl_ocwm.data.dataset import EpisodeDataset
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.envs.workspace import Workspace
+from torchrl_ocwm.images import ImageSize
 
 #: Changes to the size ``debug`` for each style.
 STYLES = {
@@ -22,7 +24,7 @@ STYLES = {
 }
 
 
-def reacher_task(image_size: int = 64) -> Task:
+def reacher_task(image_size: ImageSize = 64) -> Task:
     """The shapes of Reacher."""
     workspace = Workspace(low=(-0.24, -0.24), high=(0.24, 0.24), reach=(0.042, 0.24))
     return Task("reacher", image_size, ("finger",), 5, 2, workspace)
@@ -31,7 +33,7 @@ def reacher_task(image_size: int = 64) -> Task:
 def random_records(task: Task, batch: int, time: int, *, seed: int = 0) -> TensorDict:
     """Random records ``[batch, time]`` of a task, the first of each sequence with ``is_init`` set."""
     generator = torch.Generator().manual_seed(seed)
-    shape, size, objects = (batch, time), task.image_size, len(task.objects)
+    shape, size, objects = (batch, time), task.image_shape, len(task.objects)
 
     def uniform(*features: int) -> torch.Tensor:
         return torch.rand(*shape, *features, generator=generator)
@@ -43,11 +45,11 @@ def random_records(task: Task, batch: int, time: int, *, seed: int = 0) -> Tenso
     done = torch.zeros(*shape, 1, dtype=torch.bool)
     return TensorDict(
         {
-            "action": 2 * uniform(task.action) - 1,
+            "action": _action(task, uniform(task.action)),
             "is_init": is_init,
             "next": {
-                "pixels": (256 * uniform(3, size, size)).to(torch.uint8),
-                "masks": uniform(objects, size, size) > 0.9,
+                "pixels": (256 * uniform(3, *size)).to(torch.uint8),
+                "masks": uniform(objects, *size) > 0.9,
                 "proprio": uniform(task.proprio),
                 "object_position": position,
                 "object_visible": torch.ones(*shape, objects, dtype=torch.bool),
@@ -59,6 +61,11 @@ def random_records(task: Task, batch: int, time: int, *, seed: int = 0) -> Tenso
         },
         shape,
     )
+
+
+def _action(task: Task, drawn: torch.Tensor) -> torch.Tensor:
+    """Actions ``[..., A]`` of numbers in [0, 1]."""
+    return one_hot(drawn.argmax(-1), task.action).float() if task.discrete else 2 * drawn - 1
 
 
 def random_dataset(path: str | Path, task: Task, *, episodes: int = 4, length: int = 20) -> EpisodeDataset:

@@ -109,7 +109,7 @@ DAMAGES: dict[str, Callable[[Any], Any]] = {
     "another row": put("agent", "world_model", "name", value="flat"),
     "objects are a text": put("task", "objects", value="finger"),
     "image size is a text": put("task", "image_size", value="64"),
-    "image cannot be halved": put("task", "image_size", value=63),
+    "image of three sides": put("task", "image_size", value=[3, 64, 64]),
     "workspace is a list": put("task", "workspace", value=[-1, 1]),
     "workspace without corner": drop("task", "workspace", "low"),
     "workspace upside down": put("task", "workspace", "low", value=[9.0, 9.0]),

@@ -64,6 +64,13 @@ def test_one_render_gives_colours_segments_and_depth(open_camera, data):
     assert (frame.depth.shape, frame.depth.dtype) == ((HEIGHT, WIDTH), np.float32)
 
 
+def test_a_picture_is_the_colours_alone(open_camera, data):
+    camera = open_camera("tilted")
+    picture = camera.picture(data)
+    assert np.array_equal(picture, camera.render(data).pixels)
+    assert picture.std() > 1
+
+
 def test_segments_are_where_the_geoms_are(open_camera, data):
     geoms = open_camera().render(data).geoms
     assert geoms[pixel_of(-0.4, 0.3, 0.3)] == BOX
@@ -106,7 +113,7 @@ def test_depth_only_when_asked_for(open_camera, data):
 
 def test_frames_are_copies(open_camera, model, data):
     camera = open_camera()
-    before = camera.render(data, depth=True, fine_pixels=True)
+    before = camera.render(data, depth=True)
     kept = [part.copy() for part in before]
     moved = mujoco.MjData(model)
     moved.geom_xpos[:] = data.geom_xpos[::-1]
@@ -271,11 +278,9 @@ def test_closing_a_camera_leaves_the_others_alone(open_camera, model, data):
         assert np.array_equal(old, new)
 
 
-def test_fine_pixels_are_those_of_a_larger_camera(open_camera, data):
-    frame = open_camera(mask_scale=3).render(data, depth=True, fine_pixels=True)
-    large = open_camera(height=3 * HEIGHT, width=3 * WIDTH).render(data, depth=True)
-    assert np.array_equal(frame.fine_pixels, large.pixels)
-    assert np.array_equal(frame.geoms, large.geoms)
-    assert np.array_equal(frame.depth, large.depth)
-    assert np.array_equal(frame.pixels, open_camera().render(data).pixels)
-    assert open_camera().render(data).fine_pixels is None
+def test_a_fine_picture_is_that_of_a_larger_camera(open_camera, data):
+    camera, large = open_camera(mask_scale=3), open_camera(height=3 * HEIGHT, width=3 * WIDTH)
+    assert np.array_equal(camera.picture(data, fine=True), large.picture(data))
+    frame = camera.render(data)  # which uses the same buffers
+    assert np.array_equal(frame.geoms, large.render(data).geoms)
+    assert np.array_equal(frame.pixels, open_camera().picture(data))

@@ -501,6 +501,59 @@ def test_goal_observation_leaves_the_episode_alone(env: PositioningEnv, twin: Po
     assert_same(env.reset()[0], twin.reset()[0])
 
 
+# What is moved in a running episode.
+
+
+def test_another_goal_in_a_running_episode(env: PositioningEnv, twin: PositioningEnv) -> None:
+    env.reset(seed=20, options={"goal_position": GOAL})
+    twin.reset(seed=20, options={"goal_position": -GOAL * (1, -1)})
+    before = state(env)
+    observation = env.set_goal((-0.1, 0.12))
+    assert np.array_equal(state(env), before)
+    assert env.goal_position == pytest.approx(np.array([-0.1, 0.12]))
+    assert_same(observation, twin.set_goal((-0.1, 0.12)))
+    first, second = env.step(still(env)), twin.step(still(env))
+    assert_same(first[0], second[0])
+    assert first[1] == second[1] == pytest.approx(-np.hypot(*(first[0]["object_position"][0] - (-0.1, 0.12))))
+    with pytest.raises(ValueError, match="outside the workspace"):
+        env.set_goal((0.1, 1.0))
+    assert env.goal_position == pytest.approx(np.array([-0.1, 0.12]))
+
+
+def test_a_moved_object_is_there_and_the_episode_goes_on(env: PositioningEnv, case: Case) -> None:
+    env.reset(seed=21, options={"goal_position": GOAL})
+    env.step(still(env))
+    fixed = sorted({0, 1, 2} - set(env.axes))
+    before = env._true_position(env.data)[0, fixed]
+    observation = env.move_object((-0.1, 0.05))
+    assert observation["object_position_true"][0] == pytest.approx(np.array([-0.1, 0.05]), abs=1e-6)
+    assert env._true_position(env.data)[0, fixed] == pytest.approx(before, abs=1e-6)
+    assert observation["goal_position"] == pytest.approx(GOAL)
+    assert error(observation) < case.error
+    after = env.step(still(env))[0]["object_position_true"][0]
+    assert abs(after[0] + 0.1) < 0.01  # and it does not fly away; in the air it falls
+    with pytest.raises(ValueError, match="outside the workspace"):
+        env.move_object((1.0, 0.0))
+    with pytest.raises(ValueError, match=f"object_index must be below {len(case.objects)}"):
+        env.move_object(GOAL, len(case.objects))
+
+
+def test_a_hidden_object_keeps_the_place_it_was_moved_to(env: PositioningEnv, hide: Callable[..., None]) -> None:
+    env.reset(seed=22)
+    seen = env.move_object((-0.1, 0.05))["object_position"]
+    hide()
+    assert np.array_equal(env.step(still(env))[0]["object_position"], seen)
+
+
+def test_what_is_seen_at_a_point_of_the_image_is_the_inverse_of_where_it_is(env: PositioningEnv) -> None:
+    env.reset(seed=23)
+    places = env.workspace.grid(4).numpy()
+    points = env.project(places)
+    assert points.std(axis=(0, 1)).min() > 2  # pixels
+    assert env.unproject(points) == pytest.approx(places, abs=1e-5)
+    assert env.unproject(points[1, 2].tolist()) == pytest.approx(places[1, 2], abs=1e-5)
+
+
 # Names.
 
 

@@ -283,3 +283,28 @@ def test_sizes_below_one(name, value):
 def test_negative_target():
     with pytest.raises(ValueError, match="virtual_target is a diameter in pixels, 0 for none; got -1"):
         Reacher(virtual_target=-1)
+
+
+def test_positions_at_points_of_the_image_in_closed_form() -> None:
+    """The camera looks straight down from the middle, over 75 cm, with MuJoCo's default view of 45 degrees."""
+    with closing(Reacher()) as env:
+        fovy, height = env.model.cam_fovy[env.camera.camera_id], 0.75 - 0.01
+        half = height * np.tan(np.deg2rad(fovy) / 2)  # metres from the middle to the edge of the image
+        assert env.unproject([[32, 32], [48, 32], [32, 48]]) == pytest.approx(
+            np.array([[0, 0], [half / 2, 0], [0, -half / 2]]), abs=1e-6
+        )
+
+
+def test_a_point_where_there_is_no_plane() -> None:
+    with closing(Reacher()) as env:
+        env.data.cam_xmat[env.camera.camera_id] = np.diag([1, -1, -1]).ravel()  # it looks up
+        with pytest.raises(ValueError, match=r"does not see the plane of the goals at \[32.0, 32.0\]"):
+            env.unproject([32, 32])
+
+
+def test_three_axes_lie_in_a_horizontal_plane(monkeypatch: pytest.MonkeyPatch) -> None:
+    with closing(Reacher()) as env:
+        monkeypatch.setattr(env, "_axes", [0, 1, 2])
+        assert env.unproject(env.project(np.array([0.1, -0.05, 0.2])), height=0.2) == pytest.approx(
+            np.array([0.1, -0.05, 0.2]), abs=1e-5
+        )

@@ -7,6 +7,8 @@ import torch
 from torch import nn
 
 from torchrl_ocwm.agents import AGENTS, SIZES, build_agent
+from torchrl_ocwm.images import ImageSize, image_shape
+from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.networks import make_image_decoder, make_image_encoder, make_mlp
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import STYLES, random_records, reacher_task
@@ -28,16 +30,24 @@ def test_image_shapes(style: str) -> None:
     assert decoder(torch.zeros(2, 5, 4), torch.zeros(2, 5, 3)).shape == (2, 5, 3, 64, 64)
 
 
-@pytest.mark.parametrize(
-    ("style", "image_size", "message"),
-    [
-        ("dreamer_v3", 60, "halves the image 4 times, which an image of 60 x 60 pixels does not allow"),
-        ("dreamer_v2", 32, "takes images of 64 x 64 pixels, got 32 x 32"),
-    ],
-)
-def test_image_sizes_that_the_cnn_cannot_take(style: str, image_size: int, message: str) -> None:
+def test_the_style_whose_cnn_has_one_size_says_so() -> None:
+    message = "takes images of 64 x 64 pixels, got 32 x 32; style='dreamer_v3' takes images of any size"
     with pytest.raises(ValueError, match=message):
-        build_agent("dreamer_pcp", reacher_task(image_size), change(SIZES["debug"], STYLES[style]))
+        build_agent("dreamer_pcp", reacher_task(32), change(SIZES["debug"], STYLES["dreamer_v2"]))
+
+
+@pytest.mark.parametrize(("size", "larger"), [(84, 84), ((30, 70), (32, 72)), ((1, 17), (4, 20))])
+def test_images_of_any_size_are_cut_out_of_those_that_the_decoder_can_double_its_way_to(
+    size: ImageSize, larger: ImageSize
+) -> None:
+    architecture = Architecture(cnn_depth=4, cnn_mults=(1, 2))
+    encoder, features = make_image_encoder(architecture, size)
+    height, width = image_shape(size)
+    code = encoder(torch.rand(2, 3, height, width))
+    assert code.shape == (2, features)
+    decoder, whole = (make_image_decoder(architecture, features, one) for one in (size, larger))
+    whole.load_state_dict(decoder.state_dict())
+    assert torch.equal(decoder(code), whole(code)[..., :height, :width])  # the encoder begins at the first pixel too
 
 
 @pytest.mark.parametrize("style", ["dreamer_v3", "dreamer_v2"])

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from torchrl_ocwm.agents import build_agent, save_agent
-from torchrl_ocwm.data import CollectionError
+from torchrl_ocwm.data import CollectionError, SourceError
 from torchrl_ocwm.data.dataset import DatasetError
 from torchrl_ocwm.devices import DeviceError
 from torchrl_ocwm.envs import registry
@@ -31,6 +31,7 @@ from torchrl_ocwm.training.loggers import LogError
 from torchrl_ocwm.training.offline import EvaluationError
 
 KINDS = {
+    SourceError: ValueError,
     CollectionError: RuntimeError,
     DatasetError: ValueError,
     DeviceError: ValueError,
@@ -119,8 +120,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         ),
         (
             "train_offline",
-            "dataset={small} size.architecture.cnn_mults=[1,1,1,1,1,1]",
-            "SettingsError: a CNN of 6 stages halves the image 6 times, which an image of 32 x 32 pixels",
+            "dataset={small} size.architecture.style=dreamer_v2 size.architecture.cnn_mults=[1,2,4,8] "
+            "size.architecture.gru_blocks=8",
+            "SettingsError: the CNN of style 'dreamer_v2' takes images of 64 x 64 pixels, got 32 x 32",
         ),
         (
             "train_offline",

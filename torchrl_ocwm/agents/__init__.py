@@ -18,6 +18,7 @@ from torchrl_ocwm.agents.goal_sources import (
 from torchrl_ocwm.agents.goals import FullLatent, Goal, GoalEncoding, ImageEmbedding, NoGoal, ObjectLatent, Position
 from torchrl_ocwm.agents.optimizers import Adam, DreamerV3, OptimizerPart
 from torchrl_ocwm.agents.presets import AGENTS, EXPLORERS, SIZES, agent_name
+from torchrl_ocwm.agents.requirements import lacking, remedies, ruled_out
 from torchrl_ocwm.agents.rewards import (
     FullLatentCosine,
     ImaginedReward,
@@ -86,10 +87,13 @@ __all__ = [
     "collecting_policy",
     "describe",
     "export_policy",
+    "lacking",
     "load_agent",
     "policy_inputs",
     "policy_outputs",
     "register",
+    "remedies",
+    "ruled_out",
     "save_agent",
     "shipped_agents",
 ]

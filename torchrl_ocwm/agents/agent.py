@@ -87,7 +87,7 @@ class Agent(nn.Module):
             (:class:`~torchrl_ocwm.data.RelabelGoals`).
 
     Raises:
-        SettingsError: if the choices do not fit together or an image of the task cannot be halved by the CNN.
+        SettingsError: if the choices do not fit together, or the CNN does not take images of the task.
     """
 
     def __init__(self, task: Task, config: AgentConfig, size: Size) -> None:

@@ -11,6 +11,7 @@ from tensordict.nn import (
 )
 from tensordict.utils import NestedKey
 from torch import nn
+from torch.distributions import OneHotCategoricalStraightThrough
 from torchrl.modules import IndependentNormal, SymExpTwoHot
 from torchrl.objectives import DreamerV3ActorLoss, DreamerV3ValueLoss, ValueEstimators
 
@@ -18,7 +19,7 @@ from torchrl_ocwm.agents.config import Behaviour, Learning
 from torchrl_ocwm.agents.goals import GoalEncoding
 from torchrl_ocwm.agents.rewards import ImaginedReward
 from torchrl_ocwm.agents.scene import Scene
-from torchrl_ocwm.modules import BoundedNormalActor, ImaginationEnv, RSSMWorldModel
+from torchrl_ocwm.modules import BoundedNormalActor, CategoricalActor, ImaginationEnv, RSSMWorldModel
 from torchrl_ocwm.modules.goals import GOAL
 from torchrl_ocwm.modules.networks import make_mlp
 from torchrl_ocwm.objectives import BehaviourLoss
@@ -98,22 +99,27 @@ class LearntBehaviour(nn.Module):
 
 
 def make_actor(scene: Scene, goal_features: int) -> ProbabilisticTensorDictSequential:
-    """A policy on ``latent = {state, belief, goal}``: a bounded normal, whose mean acts unless actions are drawn."""
-    size = scene.architecture
-    network = BoundedNormalActor(
-        scene.model.latent_features + goal_features,
-        scene.task.action,
-        **size.mlp,
-    )
-    return ProbabilisticTensorDictSequential(
-        TensorDictModule(network, _inputs(goal_features), ["loc", "scale"]),
-        ProbabilisticTensorDictModule(
+    """A policy on ``latent = {state, belief, goal}``: a bounded normal, or categorical for discrete actions.
+
+    Its mean or its likeliest action acts, unless actions are drawn. Gradients go through the actions that are drawn,
+    through discrete ones straight.
+    """
+    kind, parameters, distribution = (
+        (CategoricalActor, ["probs"], {"distribution_class": OneHotCategoricalStraightThrough})
+        if scene.task.discrete
+        else (
+            BoundedNormalActor,
             ["loc", "scale"],
-            ["action"],
-            distribution_class=IndependentNormal,
-            distribution_kwargs={"tanh_loc": False, "validate_args": False},
-            return_log_prob=False,
-        ),
+            {
+                "distribution_class": IndependentNormal,
+                "distribution_kwargs": {"tanh_loc": False, "validate_args": False},
+            },
+        )
+    )
+    network = kind(scene.model.latent_features + goal_features, scene.task.action, **scene.architecture.mlp)
+    return ProbabilisticTensorDictSequential(
+        TensorDictModule(network, _inputs(goal_features), parameters),
+        ProbabilisticTensorDictModule(parameters, ["action"], return_log_prob=False, **distribution),
     )
 
 

@@ -3,6 +3,9 @@
 from torchrl_ocwm.data.collect import CollectionError, collect, with_coverage
 from torchrl_ocwm.data.coverage import Coverage, coverage_curve, dataset_coverage, object_coverage, object_positions
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
+from torchrl_ocwm.data.exporting import export_dataset
+from torchrl_ocwm.data.formats import SourceError
+from torchrl_ocwm.data.importing import Importing, Keys, import_dataset
 from torchrl_ocwm.data.memory import release_pages
 from torchrl_ocwm.data.policies import ScriptedPolicy, SmoothRandomPolicy
 from torchrl_ocwm.data.records import STORED, episode_to_records
@@ -18,13 +21,18 @@ __all__ = [
     "Coverage",
     "DatasetError",
     "EpisodeDataset",
+    "Importing",
+    "Keys",
     "RelabelGoals",
     "ScriptedPolicy",
     "SmoothRandomPolicy",
+    "SourceError",
     "collect",
     "coverage_curve",
     "dataset_coverage",
     "episode_to_records",
+    "export_dataset",
+    "import_dataset",
     "make_replay_buffer",
     "object_coverage",
     "object_positions",

@@ -8,12 +8,16 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.errors import UserError
 
 #: Keys that a dataset of a task may be without.
-OPTIONAL = ("next/masks", "next/depth", "next/goal_position", "next/object_position_true", "next/truncated")
+OPTIONAL = (
+    *("next/masks", "next/depth", "next/object_position", "next/object_visible", "next/object_position_true"),
+    *("next/goal_position", "next/reward", "next/truncated"),
+)
 _POSITIONS = ("next/object_position", "next/goal_position", "next/object_position_true")
 #: So many sides of the workspace a position may lie outside of it: an object that falls, not one in millimetres.
 _FAR = 10
@@ -31,13 +35,13 @@ def record_keys(task: Task) -> dict[str, list[Any]]:
         >>> record_keys(reacher_task())["next/pixels"]
         [[3, 64, 64], 'uint8']
     """
-    objects, dim, size = len(task.objects), task.workspace.dim, task.image_size
+    objects, dim, size = len(task.objects), task.workspace.dim, task.image_shape
     return {
         "action": [[task.action], "float32"],
         "is_init": [[1], "bool"],
-        "next/pixels": [[3, size, size], "uint8"],
-        "next/masks": [[objects, size, size], "bool"],
-        "next/depth": [[1, size, size], "float32"],
+        "next/pixels": [[3, *size], "uint8"],
+        "next/masks": [[objects, *size], "bool"],
+        "next/depth": [[1, *size], "float32"],
         "next/proprio": [[task.proprio], "float32"],
         "next/object_position": [[objects, dim], "float32"],
         "next/object_visible": [[objects], "bool"],
@@ -76,6 +80,8 @@ def conform(records: TensorDictBase, task: Task, where: str = "") -> TensorDictB
     Raises:
         DatasetError: for a key that is missing, has another shape, or cannot be converted without loss.
 
+    Discrete actions may be whole numbers ``[..., 1]``.
+
     Examples:
         >>> from torchrl_ocwm.testing import random_records, reacher_task
         >>> records = random_records(reacher_task(), 1, 5)[0]
@@ -85,9 +91,13 @@ def conform(records: TensorDictBase, task: Task, where: str = "") -> TensorDictB
     """
     expected, there = record_keys(task), records.flatten_keys("/")
     missing = [name for name in expected if name not in there.keys() and name not in OPTIONAL]
+    if "next/object_position" in there.keys() and "next/object_visible" not in there.keys():
+        missing.append("next/object_visible")
     if missing:
         raise DatasetError(f"{where}records lack {', '.join(missing)}; docs/data.md has the keys and what they mean")
     converted = records.copy()
+    if task.discrete and not there["action"].is_floating_point():
+        there["action"] = _one_hot(f"{where}action", there["action"], task.action)
     for name in expected.keys() & set(there.keys()):
         shape, dtype = expected[name]
         _check_shape(f"{where}{name}", there[name].shape[records.ndim :], shape)
@@ -110,7 +120,12 @@ def check_values(records: TensorDictBase, episode_lengths: Sequence[int], task: 
     """
     most = records["action"].abs().max()
     if most > 1:
-        raise DatasetError(f"{where}action: {most:g} is beyond ±1; scale actions to what the robot takes at most")
+        raise DatasetError(
+            f"{where}action: {most:g} is beyond ±1; scale actions to what the robot takes at most "
+            "(ActionRange(low, high).normalise)"
+        )
+    if task.discrete:
+        _check_choices(f"{where}action", records)
     for name in _POSITIONS:
         if tuple(name.split("/")) in records.keys(True):
             _check_metres(f"{where}{name}", records[tuple(name.split("/"))], task)
@@ -129,6 +144,17 @@ def _check_shape(name: str, shape: torch.Size, expected: list[int]) -> None:
     if len(expected) == 3 and [*shape] == [*expected[1:], expected[0]]:
         raise DatasetError(f"{name}: has shape {(*shape,)}, channels last; the contract is {(*expected,)}, permute it")
     raise DatasetError(f"{name}: has shape {(*shape,)} per record, the task says {(*expected,)}")
+
+
+def _one_hot(name: str, choice: Tensor, actions: int) -> Tensor:
+    """Whole numbers ``[..., 1]``."""
+    least, most = int(choice.min()), int(choice.max())
+    if choice.shape[-1:] != (1,) or least < 0 or most >= actions:
+        raise DatasetError(
+            f"{name}: the task has actions 0 to {actions - 1}, as one whole number each, got {least} to {most} of "
+            f"shape {(*choice.shape,)}"
+        )
+    return one_hot(choice.squeeze(-1).long(), actions).float()
 
 
 def _to_float(name: str, value: Tensor) -> Tensor:
@@ -177,6 +203,14 @@ def _check_metres(name: str, position: Tensor, task: Task) -> None:
         raise DatasetError(
             f"{name}: {position.abs().max():g} is far outside the workspace, {task.workspace.low} to "
             f"{task.workspace.high}; positions are metres from the start position"
+        )
+
+
+def _check_choices(name: str, records: TensorDictBase) -> None:
+    action = records["action"][~records["is_init"].squeeze(-1)]
+    if not torch.equal(action, one_hot(action.argmax(-1), action.shape[-1]).to(action)):
+        raise DatasetError(
+            f"{name}: the task's actions are discrete; each is a whole number, or 1 at one place and 0 elsewhere"
         )
 
 

@@ -46,6 +46,9 @@ class EpisodeDataset:
     after a power cut. Memory stays flat: pages are handed back to the system
     (:func:`~torchrl_ocwm.data.release_pages`).
 
+    ``len(dataset)`` is the number of episodes, ``dataset[i]`` the records of one, and a loop goes over all of them;
+    :attr:`records` are all in one.
+
     Start a dataset with :meth:`create`, open one with :meth:`open`. Only one that is open for writing can grow, and
     only one process at a time can have it so, until :meth:`close` or the end of a ``with`` block. Any number may read.
 
@@ -139,6 +142,15 @@ class EpisodeDataset:
             raise
         return dataset
 
+    @classmethod
+    def load_memmap(cls, path: str | Path) -> TensorDictBase:
+        """The :attr:`records` of the dataset in a folder, as :meth:`tensordict.TensorDict.load_memmap` reads tensors.
+
+        Raises:
+            DatasetError: as :meth:`open` does.
+        """
+        return cls.open(path).records
+
     def close(self) -> None:
         """End writing, so that another process may. The dataset can still be read."""
         if self._writing is not None:
@@ -205,9 +217,29 @@ class EpisodeDataset:
         """Number of episodes."""
         return len(self.episode_lengths)
 
+    def __repr__(self) -> str:
+        """What it holds, in a few lines."""
+        source = self._index.get("environment", "records without a task")
+        keys = "".join(f"\n    {name}: {dtype} {(*shape,)}" for name, (shape, dtype) in self._index["keys"].items())
+        return f"EpisodeDataset({self.path}: {source}, {len(self)} episodes, {self.num_steps} steps){keys}"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process opens it to read; nothing of the files is copied."""
+        return type(self).open, (self.path.absolute(),)
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        """The records ``[T + 1]`` of one episode after the other, in memory of their own."""
+        return (self[number] for number in range(len(self)))
+
     def __getitem__(self, episode: int) -> TensorDictBase:
-        """Records ``[T + 1]`` of an episode, in memory of their own."""
-        number = range(len(self))[episode]
+        """Records ``[T + 1]`` of an episode, in memory of their own; −1 is the last.
+
+        Raises:
+            IndexError: if there is no such episode.
+        """
+        if not -len(self) <= episode < len(self):
+            raise IndexError(f"{self.path}: has episodes 0 to {len(self) - 1}, no {episode}")
+        number = episode % len(self)
         start = sum(self.episode_lengths[:number])
         records = self.records[start : start + self.episode_lengths[number]].clone()
         release_pages(self.records)

@@ -198,7 +198,12 @@ def _plain(name: str, value: Any) -> None:
 _text = _is("a name", lambda value: isinstance(value, str) and bool(value.strip()) and "${" not in value)
 _number = _is("a number", lambda value: type(value) in (int, float) and abs(value) <= 1e6)
 _share = _is("a share of 1", lambda value: type(value) in (int, float) and 0 <= value <= 1)
+_flag = _is("true or false", lambda value: isinstance(value, bool))
 _dtype = _is(f"one of {', '.join(DTYPES)}", lambda value: isinstance(value, str) and value in DTYPES)
+
+
+def _image_size(name: str, value: Any) -> None:
+    (_list(_count(1), exactly=2) if isinstance(value, list) else _count(1))(name, value)
 
 
 def _options(name: str, value: Any) -> None:
@@ -216,13 +221,17 @@ WORKSPACE = {"low": _list(_number, least=1), "high": _list(_number, least=1)}
 WORKSPACE_OPTIONAL = {"reach": _or_null(_list(_number, exactly=2)), "landmarks": _list(_list(_number, least=1))}
 TASK = {
     "name": _text,
-    "image_size": _count(1),
+    "image_size": _image_size,
     "objects": _list(_text, least=1),
     "proprio": _count(1),
     "action": _count(1),
     "workspace": _fields(WORKSPACE, WORKSPACE_OPTIONAL),
 }
-TASK_OPTIONAL = {"options": _options}
+TASK_OPTIONAL = {
+    "options": _options,
+    "action_range": _or_null(_fields({"low": _list(_number, least=1), "high": _list(_number, least=1)}, {})),
+    "discrete": _flag,
+}
 _INDEX = _fields(
     {
         "format": _text,

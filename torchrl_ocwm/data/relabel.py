@@ -68,7 +68,9 @@ class RelabelGoals(Transform):
         return self.goals == "uniform" or (self.goals == "auto" and not self._images_show_goal)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write goals and rewards into a batch ``[B, T]``."""
+        """Write goals and rewards into a batch ``[B, T]``; nothing without positions."""
+        if ("next", "object_position") not in tensordict.keys(True):
+            return tensordict
         position = tensordict["next", "object_position"][..., self.object_index, :]
         if self._draws:
             goal = self.workspace.sample(position.shape[:-2]).to(position).unsqueeze(-2).expand_as(position)

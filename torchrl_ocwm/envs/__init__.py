@@ -20,6 +20,7 @@ from torchrl_ocwm.envs.rays import intersect_rays, undistort
 from torchrl_ocwm.envs.registry import (
     ENVIRONMENTS,
     EnvChoice,
+    RecordedEnv,
     find_environment,
     make_env,
     make_scene,
@@ -28,7 +29,7 @@ from torchrl_ocwm.envs.registry import (
 )
 from torchrl_ocwm.envs.sam2_masks import SAM2Masks
 from torchrl_ocwm.envs.scripted import ScriptedAction
-from torchrl_ocwm.envs.task import Task
+from torchrl_ocwm.envs.task import ActionRange, Task
 from torchrl_ocwm.envs.workspace import Workspace
 from torchrl_ocwm.lazy import lazily
 
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ENVIRONMENTS",
+    "ActionRange",
     "Calibration",
     "CalibrationError",
     "Camera",
@@ -56,6 +58,7 @@ __all__ = [
     "PickPlace",
     "PositioningEnv",
     "Reacher",
+    "RecordedEnv",
     "SAM2Masks",
     "ScriptedAction",
     "ShelfPlace",

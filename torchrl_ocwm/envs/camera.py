@@ -27,13 +27,11 @@ class Frame(NamedTuple):
         geoms: ``[S * H, S * W]`` int32, the id of the geom seen at each pixel, -1 where there is none; S is the
             ``mask_scale`` of the camera.
         depth: ``[S * H, S * W]`` float32, metres along the optical axis; ``None`` unless asked for.
-        fine_pixels: ``[S * H, S * W, 3]`` uint8, colours as fine as the segmentation; ``None`` unless asked for.
     """
 
     pixels: np.ndarray
     geoms: np.ndarray
     depth: np.ndarray | None
-    fine_pixels: np.ndarray | None = None
 
 
 class Camera:
@@ -134,13 +132,27 @@ class Camera:
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         close_at_exit(self)
 
-    def render(self, data: mujoco.MjData, *, depth: bool = False, fine_pixels: bool = False) -> Frame:
+    def render(self, data: mujoco.MjData, *, depth: bool = False) -> Frame:
         """Render the state in ``data``, which must be up to date (``mj_forward``).
 
         Args:
             data: A state of the camera's model.
             depth: Read the depth too; it comes out of the segmentation pass.
-            fine_pixels: Also render colours that are as fine as the segmentation, in a pass of their own.
+        """
+        pixels = self.picture(data)
+        flags = self._scene.flags
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
+        mujoco.mjr_render(self._fine, self._scene, self._context)
+        mujoco.mjr_readPixels(self._ids, self._depth if depth else None, self._fine, self._context)
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
+        return Frame(pixels, self._geoms(), self._metres() if depth else None)
+
+    def picture(self, data: mujoco.MjData, *, fine: bool = False) -> np.ndarray:
+        """Render the colours alone, ``[H, W, 3]`` uint8: the first pass of :meth:`render`.
+
+        Args:
+            data: A state of the camera's model.
+            fine: As large as the segmentation, ``[S * H, S * W, 3]``.
         """
         if self._context is None:
             raise RuntimeError("this camera is closed")
@@ -149,17 +161,7 @@ class Camera:
         mujoco.mjv_updateScene(self.model, data, self._options, None, self._view, everything, self._scene)
         if self._scene.ngeom > self._max_geoms:
             raise ValueError(f"the scene has more than {self._max_geoms} geoms; give the camera a larger max_geoms")
-        pixels = self._colours(self._rectangle, self._pixels)
-        fine = self._colours(self._fine, self._ids) if fine_pixels else None
-
-        flags = self._scene.flags
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
-        mujoco.mjr_render(self._fine, self._scene, self._context)
-        mujoco.mjr_readPixels(self._ids, self._depth if depth else None, self._fine, self._context)
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
-        return Frame(pixels, self._geoms(), self._metres() if depth else None, fine)
-
-    def _colours(self, size: mujoco.MjrRect, buffer: np.ndarray) -> np.ndarray:
+        size, buffer = (self._fine, self._ids) if fine else (self._rectangle, self._pixels)
         mujoco.mjr_render(size, self._scene, self._context)
         mujoco.mjr_readPixels(buffer, None, size, self._context)
         return buffer[::-1].copy()  # OpenGL's rows run upwards

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -94,6 +95,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     depth_offset: ClassVar[float] = 0.0
     blind: bool = False
     _colour_masks: ColourMasks | None = None
+    _made_with: partial[PositioningEnv]
 
     def __init__(
         self,
@@ -139,6 +141,17 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         self.observation_space = self._observation_space()  # type: ignore[assignment]
         self.action_space = spaces.Box(-1.0, 1.0, self._action_shape(), np.float32)
         self._colour_masks = self._learn_colours(labelled_frames) if labelled_frames else None
+
+    def __new__(cls, *arguments: Any, **options: Any) -> PositioningEnv:
+        """Keep what it is made with, to make it again where it is unpickled."""
+        env = super().__new__(cls)
+        env._made_with = partial(cls, *arguments, **options)
+        return env
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A simulator is not pickled but made anew, and has to be reset; its random numbers go on."""
+        kept = ("spec", "_np_random", "_np_random_seed")
+        return self._made_with, (), {name: self.__dict__[name] for name in kept if name in self.__dict__}
 
     # What a suite fills in.
 
@@ -260,6 +273,56 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
 
     # Goals and observations.
 
+    @property
+    def goal_position(self) -> np.ndarray:
+        """The goal of the running episode, (D,) float32 metres."""
+        return self._goal.copy()
+
+    def set_goal(self, goal_position: np.ndarray | Sequence[float]) -> Observation:
+        """Give the running episode another goal (D,), metres; what is seen with it.
+
+        Raises:
+            ValueError: for a goal outside the workspace.
+        """
+        self._check_open()
+        self._goal = self._check_goal(goal_position)
+        return self._observe(self.data)
+
+    def move_object(self, position: np.ndarray | Sequence[float], object_index: int = 0) -> Observation:
+        """Disturb the running episode: put an object somewhere else; what is seen then.
+
+        An object that moves freely keeps its turn, and its coordinates on other axes. What is part of a robot is
+        brought there with it, or as near as can be.
+
+        Args:
+            position: (D,) metres, in the workspace.
+            object_index: Which object.
+
+        Raises:
+            ValueError: for a position outside the workspace, or an object that there is not.
+        """
+        self._check_open()
+        place = self._check_goal(position)
+        self._check_object(object_index)
+        joint = self._free_joint(object_index)
+        if joint is None:
+            self._teleport(self.data, place, object_index)
+        else:
+            moved = place - self._relative(self._true_position(self.data))[object_index]
+            address, speed = self.model.jnt_qposadr[joint], self.model.jnt_dofadr[joint]
+            self.data.qpos[address + np.array(self._axes)] += moved
+            self.data.qvel[speed : speed + 6] = 0
+        mujoco.mj_forward(self.model, self.data)
+        observation = self._observe(self.data)
+        self._last_seen = observation["object_position"]
+        return observation
+
+    def _free_joint(self, object_index: int) -> int | None:
+        """The joint that lets an object move in all directions, if it has one."""
+        body = self.model.body_rootid[self.model.geom_bodyid[self._geom_ids[object_index][0]]]
+        joint = self.model.body_jntadr[body]
+        return joint if joint >= 0 and self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE else None
+
     def goal_observation(self, goal_position: np.ndarray, object_index: int = 0) -> Observation:
         """What would be seen with an object at a goal; the running episode is not touched.
 
@@ -272,10 +335,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         """
         self._check_open()
         goal = self._check_goal(goal_position)
-        if not 0 <= object_index < len(self.objects):
-            raise ValueError(
-                f"object_index must be below {len(self.objects)}, the number of objects; got {object_index}"
-            )
+        self._check_object(object_index)
         if self._scratch is None:
             self._scratch = mujoco.MjData(self.model)
         full = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -291,6 +351,12 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         if goal.shape != (self.workspace.dim,):
             raise ValueError(f"one goal position of shape ({self.workspace.dim},) is needed, got {tuple(goal.shape)}")
         return goal.numpy()
+
+    def _check_object(self, object_index: int) -> None:
+        if not 0 <= object_index < len(self.objects):
+            raise ValueError(
+                f"object_index must be below {len(self.objects)}, the number of objects; got {object_index}"
+            )
 
     def _observation_space(self) -> spaces.Dict:
         size, objects, dim = self.image_size, len(self.objects), self.workspace.dim
@@ -327,8 +393,8 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         return observation
 
     def _look(self, data: mujoco.MjData, goal: np.ndarray) -> _Seen:
-        frame = self.camera.render(data, depth=self._plane is None, fine_pixels=self._colour_masks is not None)
-        fine_masks = self._segment(frame)
+        frame = self.camera.render(data, depth=self._plane is None)
+        fine_masks = self._segment(frame, data)
         masks = fine_masks[:, self.mask_scale // 2 :: self.mask_scale, self.mask_scale // 2 :: self.mask_scale]
         world, visible = masks_to_positions(
             torch.from_numpy(fine_masks),
@@ -340,11 +406,14 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         pixels = self._paint_target(frame.pixels, masks.any(0), goal, data).transpose(2, 0, 1)
         return pixels, masks.copy(), self._relative(world.numpy()), visible.numpy()
 
-    def _segment(self, frame: Frame) -> np.ndarray:
+    def _segment(self, frame: Frame, data: mujoco.MjData) -> np.ndarray:
         """Masks (O, S * H, S * W), by colour if colours were learnt."""
         if self._colour_masks is None:
             return np.array([_any_of(frame.geoms, ids) for ids in self._geom_ids])
-        return self._colour_masks.segment(_channels_first(frame.fine_pixels)).numpy()
+        return self._colour_masks.segment(self._fine_picture(data)).numpy()
+
+    def _fine_picture(self, data: mujoco.MjData) -> torch.Tensor:
+        return torch.from_numpy(self.camera.picture(data, fine=True)).movedim(-1, 0)
 
     def _learn_colours(self, frames: int) -> ColourMasks:
         """From goal observations of each object in turn, always the same."""
@@ -353,9 +422,8 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         pixels, masks = [], []
         for number, place in enumerate(places):
             self.goal_observation(place, number % len(self.objects))
-            frame = self.camera.render(self._scratch, fine_pixels=True)
-            pixels.append(_channels_first(frame.fine_pixels))
-            masks.append(torch.from_numpy(self._segment(frame)))
+            pixels.append(self._fine_picture(self._scratch))
+            masks.append(torch.from_numpy(self._segment(self.camera.render(self._scratch), self._scratch)))
         self._np_random = self._np_random_seed = None  # a reset without a seed is random, as ever
         return ColourMasks.fit(torch.stack(pixels), torch.stack(masks))
 
@@ -400,6 +468,32 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         """Where a position (..., D), metres from the start, appears in the image: (..., 2) as (column, row)."""
         return self._project(position, self.data)
 
+    def unproject(self, point: np.ndarray | Sequence[float], height: float = 0.0) -> np.ndarray:
+        """Which position (..., D), metres from the start, appears at a point (..., 2) of the image, (column, row).
+
+        The inverse of :meth:`project`. Positions with two axes lie in the plane of these axes through the start;
+        those with three lie in a horizontal plane.
+
+        Args:
+            point: (..., 2) pixels.
+            height: Of that plane above the start, metres; for positions with three axes.
+
+        Raises:
+            ValueError: for a point where the camera does not see the plane.
+        """
+        self._check_open()
+        pose, point = self.camera.extrinsics(self.data).astype(np.float64), np.asarray(point, np.float64)
+        pixels = np.concatenate([point, np.ones((*point.shape[:-1], 1))], -1)
+        rays = pixels @ np.linalg.inv(self._intrinsics.numpy().astype(np.float64)).T @ pose[:3, :3].T
+        across = 2 if len(self._axes) == 3 else ({0, 1, 2} - set(self._axes)).pop()
+        level = self._start[across] + (height if len(self._axes) == 3 else 0.0) - pose[across, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = level / rays[..., across]
+        if not (np.isfinite(far) & (far > 0)).all():
+            raise ValueError(f"the camera does not see the plane of the goals at {point.tolist()} (column, row)")
+        world = pose[:3, 3] + far[..., None] * rays
+        return (world - self._start)[..., self._axes].astype(np.float32)
+
     def _project(self, position: np.ndarray, data: mujoco.MjData) -> np.ndarray:
         world = np.broadcast_to(self._start, (*position.shape[:-1], 3)).copy()
         world[..., self._axes] += position
@@ -407,11 +501,6 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         in_camera = (world - pose[:3, 3]) @ pose[:3, :3]
         in_image = in_camera @ self._intrinsics.numpy().T
         return in_image[..., :2] / in_image[..., 2:]
-
-
-def _channels_first(pixels: np.ndarray | None) -> torch.Tensor:
-    assert pixels is not None
-    return torch.from_numpy(pixels).movedim(-1, 0)
 
 
 def _any_of(geoms: np.ndarray, ids: list[int]) -> np.ndarray:

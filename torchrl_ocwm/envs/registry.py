@@ -128,6 +128,24 @@ class EnvChoice(Settings):
         from_dict(environment.options, self.options, "options")
 
 
+@dataclass(frozen=True)
+class RecordedEnv(EnvChoice):
+    """What a dataset was recorded in: an environment, or something that nobody has registered, such as your robot.
+
+    Args:
+        name: Its name, as the dataset has it.
+
+    Examples:
+        >>> RecordedEnv("my_arm").options
+        {}
+    """
+
+    def validate(self) -> None:
+        """Options are those of the environment, if that is known."""
+        if _look_up(self.name) is not None:
+            super().validate()
+
+
 def make_env(
     name: str | Environment,
     *,

@@ -17,7 +17,7 @@ from torchrl_ocwm.evaluation.episodes import (
 )
 from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
 from torchrl_ocwm.evaluation.imagined import imagined_distance, imagined_rollout, predicted_return
-from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation
+from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation, can_play
 from torchrl_ocwm.evaluation.objects import object_errors
 from torchrl_ocwm.evaluation.open_loop import random_sequences
 from torchrl_ocwm.evaluation.output import writing
@@ -41,6 +41,7 @@ __all__ = [
     "OpenLoopFilm",
     "ReconstructionError",
     "Report",
+    "can_play",
     "check_ffmpeg",
     "decode_video",
     "draw_errors",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
@@ -19,6 +20,26 @@ from torchrl_ocwm.processes import Worker, make_worker
 from torchrl_ocwm.settings import SettingsError
 
 _TIMEOUT = 300.0  # seconds without a step; where training uses all cores, an environment may take long to load
+
+
+def can_play(task: Task) -> bool:
+    """Whether a task's environment is registered, so that agents can be evaluated in it; warns if it is not.
+
+    Examples:
+        >>> from torchrl_ocwm.testing import reacher_task
+        >>> can_play(reacher_task())
+        True
+    """
+    try:
+        find_environment(task.name)
+    except SettingsError:
+        warnings.warn(
+            f"no evaluations during training: no environment {task.name!r} is registered, only recordings are there; "
+            "diagnose examines the world model on them, and training.eval_interval=0 silences this",
+            stacklevel=2,
+        )
+        return False
+    return True
 
 
 class LandmarkEvaluation:

@@ -37,12 +37,13 @@ def object_errors(model: RSSMWorldModel, records: TensorDictBase, context: int) 
         "filtered": posterior(model, records, "state", "belief")[:, context:],
         "imagined": open_loop_latents(model, records, context)[:, context:],
     }
-    future, masks = records[:, context:], instance_masks(records["next", "masks"])[..., :-1, :, :]
+    future = records[:, context:]
     errors: dict[str, dict[str, Tensor]] = {name: {} for name in (*views, "unmoved")}
     if "object_position" in model.decoded:
         errors = {name: quartiles(position_error(model, latents, future)) for name, latents in views.items()}
         errors["unmoved"] = quartiles(unmoved_error(records, context)[:, context:])
     if isinstance(model, ObjectWorldModel):
+        masks = instance_masks(records["next", "masks"])[..., :-1, :, :]
         overlaps = {name: mask_overlap(model, latents, masks[:, context:]) for name, latents in views.items()}
         overlaps["unmoved"] = intersection_over_union(masks[:, context - 1 : context], masks[:, context:])
         for name, overlap in overlaps.items():

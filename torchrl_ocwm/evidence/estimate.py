@@ -154,7 +154,7 @@ def seconds_of_acting(agent: Agent) -> float:
     """Of a step of an agent that has learnt nothing yet, of several that act at the same time."""
     task, policy = agent.task, agent.policy()
     goals = task.workspace.grid(2).flatten(0, 1)
-    images = torch.zeros(len(goals), 3, task.image_size, task.image_size, dtype=torch.uint8)
+    images = torch.zeros(len(goals), 3, *task.image_shape, dtype=torch.uint8)
     given = None if policy.takes_positions else images
     with EvaluationEnvs(task, episode_steps=_STEPS, workers=0, envs=len(goals)) as envs:
         envs.run(policy, goals, images=given)

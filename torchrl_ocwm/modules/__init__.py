@@ -1,7 +1,7 @@
 """What predicts: encoders, world models, goals, imagined rewards, the imagination environment, acting."""
 
 from torchrl_ocwm.modules.acting import ActingLatent
-from torchrl_ocwm.modules.actor import BoundedNormalActor
+from torchrl_ocwm.modules.actor import BoundedNormalActor, CategoricalActor
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.ensemble import DisagreementReward, OneStepEnsemble, disagreement
 from torchrl_ocwm.modules.future_goals import FutureGoals
@@ -28,6 +28,7 @@ __all__ = [
     "ActingLatent",
     "Architecture",
     "BoundedNormalActor",
+    "CategoricalActor",
     "DisagreementReward",
     "EntropyReward",
     "FlatWorldModel",

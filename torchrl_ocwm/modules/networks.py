@@ -18,6 +18,7 @@ from torchrl.modules import (
     ObsEncoder,
 )
 
+from torchrl_ocwm.images import ImageSize, image_shape
 from torchrl_ocwm.modules.architecture import Architecture, Style
 from torchrl_ocwm.modules.dtypes import unit_image
 from torchrl_ocwm.modules.recurrence import BlockGRU, Posterior, Prior
@@ -56,28 +57,28 @@ def make_mlp(
     return mlp
 
 
-def make_image_encoder(architecture: Architecture, image_size: int) -> tuple[nn.Module, int]:
+def make_image_encoder(architecture: Architecture, image_size: ImageSize) -> tuple[nn.Module, int]:
     """A CNN for images ``[..., 3, H, W]`` uint8 or float32 in [0, 1], and the number of features that it gives.
 
     Raises:
-        SettingsError: if the image does not go through the CNN.
+        SettingsError: if the style has no CNN for such images.
     """
     depth, mults = architecture.cnn_depth, architecture.cnn_mults
     _check_image_size(architecture, image_size)
     if architecture.style == "dreamer_v3":
         encoder = DreamerV3ImageEncoder(3, depth, mults)
-        return fast_norms(encoder), encoder.output_features((3, image_size, image_size))
+        return fast_norms(encoder), encoder.output_features((3, *image_shape(image_size)))
     return nn.Sequential(_ScaledImage(), ObsEncoder(depth, in_channels=3)), depth * 8 * 2 * 2
 
 
 def make_image_decoder(
-    architecture: Architecture, in_features: int, image_size: int, *, channels: int = 3
+    architecture: Architecture, in_features: int, image_size: ImageSize, *, channels: int = 3
 ) -> nn.Module:
     """A CNN from latents to images ``[..., channels, H, W]`` float32 in [0, 1], unbounded."""
     depth, mults = architecture.cnn_depth, architecture.cnn_mults
     _check_image_size(architecture, image_size)
     if architecture.style == "dreamer_v3":
-        shape = (channels, image_size, image_size)
+        shape = (channels, *image_shape(image_size))
         return fast_norms(ImageDecoder(in_features, shape, depth, mults, num_blocks=1))
     return _ShiftedImage(ObsDecoder(depth, latent_dim=in_features, out_channels=channels))
 
@@ -116,21 +117,35 @@ def make_rssm(architecture: Architecture, *, action: int, embedding: int) -> tup
     return fast_norms(prior), fast_norms(posterior)
 
 
-def _check_image_size(architecture: Architecture, image_size: int) -> None:
-    if architecture.style == "dreamer_v2" and image_size != 64:
+def _check_image_size(architecture: Architecture, image_size: ImageSize) -> None:
+    height, width = image_shape(image_size)
+    if architecture.style == "dreamer_v2" and (height, width) != (64, 64):
         raise SettingsError(
-            f"the CNN of style 'dreamer_v2' takes images of 64 x 64 pixels, got {image_size} x {image_size}"
-        )
-    stages = len(architecture.cnn_mults)
-    if image_size % 2**stages:
-        raise SettingsError(
-            f"a CNN of {stages} stages halves the image {stages} times, which an image of {image_size} x "
-            f"{image_size} pixels does not allow; use a multiple of {2**stages}"
+            f"the CNN of style 'dreamer_v2' takes images of 64 x 64 pixels, got {height} x {width}; "
+            "style='dreamer_v3' takes images of any size"
         )
 
 
 class ImageDecoder(DreamerV3ImageDecoder):
-    """TorchRL's decoder, which adds the middle of the range in its last layer instead of to each pixel."""
+    """TorchRL's decoder for images of any size, which are cut out of those that it can double its way to.
+
+    It adds the middle of the range in its last layer instead of to each pixel.
+
+    Args:
+        in_features: Features of all inputs together.
+        image_shape: Channels, height and width of the images.
+        depth: Channels of the last stage before its multiplier.
+        mults: Channel multiplier of each stage, as the encoder has them.
+        num_blocks: Blocks of the first layer.
+    """
+
+    def __init__(
+        self, in_features: int, image_shape: tuple[int, int, int], depth: int, mults: tuple[int, ...], num_blocks: int
+    ) -> None:
+        channels, *self.size = image_shape
+        step = 2 ** len(mults)
+        height, width = (-(-side // step) * step for side in self.size)
+        super().__init__(in_features, (channels, height, width), depth, mults, num_blocks=num_blocks)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Images ``[..., C, H, W]`` of latents."""
@@ -139,7 +154,8 @@ class ImageDecoder(DreamerV3ImageDecoder):
         hidden = self.layers[:-1](self.projection_norm(hidden))  # with its SiLU
         last = self.layers[-1]
         image = conv_transpose2d(hidden, last.weight, last.bias + 0.5, last.stride, last.padding, last.output_padding)
-        return image.unflatten(0, latent.shape[:-1])
+        # The encoder's stages begin at the first pixel too, so that a pixel is decoded from where it was encoded.
+        return image[..., : self.size[0], : self.size[1]].unflatten(0, latent.shape[:-1])
 
 
 class _ScaledImage(nn.Module):

@@ -7,6 +7,7 @@ from typing import Any
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 
+from torchrl_ocwm.images import ImageSize
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.latent import LatentsInEmbedding, LatentsInImages
 from torchrl_ocwm.modules.networks import make_mlp
@@ -22,7 +23,7 @@ class ObjectWorldModel(RSSMWorldModel):
     latent. What is not an object, proprioception and goal, is decoded from the latent of the scene.
 
     Args:
-        image_size: Height and width of the images, pixels.
+        image_size: Height and width of the images, pixels; one number if they are the same.
         objects: Number of objects O; the background is one instance more.
         observed: Vectors that the encoder sees.
         predicted: Vectors that are decoded beside these, though it does not see them.
@@ -45,7 +46,7 @@ class ObjectWorldModel(RSSMWorldModel):
     def __init__(
         self,
         *,
-        image_size: int,
+        image_size: ImageSize,
         objects: int,
         observed: tuple[VectorName, ...],
         predicted: tuple[VectorName, ...] = (),

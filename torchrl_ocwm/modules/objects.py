@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchrl_ocwm.images import ImageSize
 from torchrl_ocwm.modules.architecture import Architecture, Style
 from torchrl_ocwm.modules.networks import make_image_decoder, make_mlp
 
@@ -63,7 +64,7 @@ class ObjectDecoder(nn.Module):
 
     Args:
         features: Features of an object latent L.
-        image_size: Height and width of the images, pixels.
+        image_size: Height and width of the images, pixels; one number if they are the same.
         architecture: Shapes of the CNN.
 
     Called with object latents ``[..., N, L]``; returns colours ``[..., N, 3, H, W]`` in [0, 1], unbounded, and mask
@@ -76,7 +77,7 @@ class ObjectDecoder(nn.Module):
         (torch.Size([5, 3, 3, 16, 16]), torch.Size([5, 3, 16, 16]))
     """
 
-    def __init__(self, features: int, image_size: int, architecture: Architecture) -> None:
+    def __init__(self, features: int, image_size: ImageSize, architecture: Architecture) -> None:
         super().__init__()
         self.cnn = make_image_decoder(architecture, features, image_size, channels=4)
 

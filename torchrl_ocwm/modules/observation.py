@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 from torchrl.objectives import symlog
 
+from torchrl_ocwm.images import ImageSize, image_shape
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.dtypes import unit_image
 from torchrl_ocwm.modules.networks import make_image_encoder, make_mlp
@@ -16,7 +17,7 @@ class ObservationEncoder(nn.Module):
     """Embed an image and vectors: a CNN for the one, an MLP on symlog values for the others, concatenated.
 
     Args:
-        image_size: Height and width of the image, pixels.
+        image_size: Height and width of the image, pixels; one number if they are the same.
         vector_features: Number of values in all vectors together; 0 for images alone.
         architecture: Shapes of CNN and MLP.
 
@@ -24,7 +25,8 @@ class ObservationEncoder(nn.Module):
     returns ``[..., features]`` float32. Without vectors their part of the embedding is zero (:meth:`image_alone`).
 
     Raises:
-        ValueError: if the image cannot be halved by every stage; when called, for inputs of other shapes.
+        SettingsError: if the style has no CNN for such images.
+        ValueError: when called, for inputs of other shapes.
 
     Examples:
         >>> encoder = ObservationEncoder(16, 5, Architecture(cnn_depth=4, cnn_mults=(1, 2)))
@@ -33,7 +35,7 @@ class ObservationEncoder(nn.Module):
         True
     """
 
-    def __init__(self, image_size: int, vector_features: int, architecture: Architecture) -> None:
+    def __init__(self, image_size: ImageSize, vector_features: int, architecture: Architecture) -> None:
         super().__init__()
         self.cnn, self.features = make_image_encoder(architecture, image_size)
         self.image_size, self.vector_features, self.mlp_units = image_size, vector_features, architecture.mlp_units
@@ -54,7 +56,7 @@ class ObservationEncoder(nn.Module):
 
     def image(self, pixels: Tensor) -> Tensor:
         """The part of an embedding that is of the image, of images ``[..., 3, H, W]``."""
-        expected = (3, self.image_size, self.image_size)
+        expected = (3, *image_shape(self.image_size))
         if pixels.shape[-3:] != expected:
             raise ValueError(f"this model takes images of shape (..., *{expected}), got {tuple(pixels.shape)}")
         return self.cnn(unit_image(pixels))

@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.modules import RSSMStateEstimatorV3, SymExpTwoHot
 
+from torchrl_ocwm.images import ImageSize
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.latent import FullLatent, InitialLatent, LatentOfImages, LatentsInEmbedding, LatentsInImages
 from torchrl_ocwm.modules.networks import make_image_decoder, make_mlp, make_rssm
@@ -34,7 +35,7 @@ class RSSMWorldModel(nn.Module, ABC):
     A subclass says how the scene is decoded: :meth:`images`, :meth:`pixels` and :meth:`object_position`.
 
     Args:
-        image_size: Height and width of the images, pixels.
+        image_size: Height and width of the images, pixels; one number if they are the same.
         proprio: Number of proprioceptive values P.
         objects: Number of objects O.
         action: Number of actions A.
@@ -49,7 +50,7 @@ class RSSMWorldModel(nn.Module, ABC):
     def __init__(
         self,
         *,
-        image_size: int,
+        image_size: ImageSize,
         proprio: int,
         objects: int,
         action: int,
@@ -199,7 +200,7 @@ class FlatWorldModel(RSSMWorldModel):
     """One latent state for the whole scene, from which image and vectors are decoded (Dreamer).
 
     Args:
-        image_size: Height and width of the images, pixels.
+        image_size: Height and width of the images, pixels; one number if they are the same.
         observed: Vectors that the encoder sees and the decoder reconstructs.
         predicted: Vectors that the decoder reconstructs, and the encoder does not see.
         architecture: Shapes of the networks.
@@ -218,7 +219,7 @@ class FlatWorldModel(RSSMWorldModel):
     def __init__(
         self,
         *,
-        image_size: int,
+        image_size: ImageSize,
         observed: tuple[VectorName, ...],
         predicted: tuple[VectorName, ...] = (),
         architecture: Architecture,

@@ -16,8 +16,8 @@ import torch
 from torchrl_ocwm.agents import AgentConfig, Size, build_agent
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.devices import usable_device
-from torchrl_ocwm.envs import EnvChoice
-from torchrl_ocwm.evaluation import LandmarkEvaluation, OpenLoopFilm
+from torchrl_ocwm.envs import RecordedEnv
+from torchrl_ocwm.evaluation import LandmarkEvaluation, OpenLoopFilm, can_play
 from torchrl_ocwm.recipes.config import keep_settings, recipe, run_folder
 from torchrl_ocwm.settings import Settings
 from torchrl_ocwm.training import Training, check_memory, evaluates_beside, train_offline
@@ -37,7 +37,7 @@ class TrainOffline(Settings):
     """
 
     agent: AgentConfig
-    env: EnvChoice
+    env: RecordedEnv
     size: Size
     training: Training = field(default_factory=Training)
     dataset: str = "data/${env.name}"
@@ -51,10 +51,10 @@ def main(config: TrainOffline) -> None:
     """Train, from the checkpoint if there is one."""
     training = config.training
     dataset = EpisodeDataset.open(config.dataset)
-    if dataset.metadata.get("environment") != config.env.name:
-        raise DatasetError(f"{dataset.path}: holds {dataset.metadata.get('environment')}, not env={config.env.name}")
+    if (recorded := dataset.task.name) != config.env.name:
+        raise DatasetError(f"{dataset.path}: holds {recorded}, not env={config.env.name}; give env.name={recorded}")
     # Whatever the command line says: the dataset's options are those that are trained on.
-    config = replace(config, env=EnvChoice(config.env.name, dataset.metadata.get("options", {})))
+    config = replace(config, env=RecordedEnv(config.env.name, dataset.metadata.get("options", {})))
     folder = run_folder(config.output)
     task = dataset.task
     check_memory(config.agent, task, config.size, usable_device(training.device))
@@ -63,7 +63,7 @@ def main(config: TrainOffline) -> None:
     # Made only if they are used: each checks whether it can do its work before any is done.
     evaluation = film = None
     with ExitStack() as stack:
-        if training.eval_interval:
+        if training.eval_interval and can_play(task):
             evaluation = stack.enter_context(
                 LandmarkEvaluation(
                     agent,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from math import prod
 
 import torch
 
@@ -39,7 +40,8 @@ def check_memory(agent: AgentConfig, task: Task, size: Size, device: torch.devic
     hidden = architecture.mlp_layers * architecture.mlp_units
     needs = {
         "parameters": _COPIES * sum(parameter.numel() for parameter in model.parameters()),
-        "batch_size x slice_len frames": 3 * frames * 3 * task.image_size**2,  # as seen, as predicted, and its gradient
+        # As seen, as predicted, and its gradient.
+        "batch_size x slice_len frames": 3 * frames * 3 * prod(task.image_shape),
         "imagination_horizon steps from each frame": frames
         * learning.imagination_horizon
         * (model.model.latent_features + 2 * hidden),

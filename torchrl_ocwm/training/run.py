@@ -17,6 +17,7 @@ from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.archive import Archive, recover
 from torchrl_ocwm.agents.checkpoint import check_same_agent, describe
+from torchrl_ocwm.agents.requirements import lacking, remedies
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals, make_replay_buffer
 from torchrl_ocwm.files import only_writer
 from torchrl_ocwm.training.cores import update_threads
@@ -208,10 +209,8 @@ def check_task(agent: Agent, dataset: EpisodeDataset) -> None:
     """
     if dataset.task != agent.task:
         raise DatasetError(f"{dataset.path}: holds {dataset.task}, but the agent was built for {agent.task}")
-    there = {*dataset.records.keys(True, True), *RelabelGoals.written}
-    missing = [key for key in agent.loss.in_keys if key not in there]
-    if missing:
-        raise DatasetError(f"{dataset.path}: holds no {missing}, which this agent learns from")
+    if missing := lacking(agent, dataset):
+        raise DatasetError(f"{dataset.path}: holds no {missing}, which this agent learns from. {remedies(missing)}")
     imagined = [name for name, one in agent.config.behaviours.items() if one.goals.gives]
     if dataset.images_show_goal and imagined:
         raise DatasetError(
