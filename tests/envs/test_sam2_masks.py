@@ -25,6 +25,8 @@ class StandIn:
     It loses an object for good when that was hidden for a frame, as a tracker may: so videos are told apart.
     """
 
+    device = torch.device("cpu")
+
     def __init__(self) -> None:
         self.videos: list[int] = []
         self.prompts: list[tuple[int, int, list, list]] = []
@@ -49,6 +51,8 @@ class StandIn:
 
     @torch.inference_mode()
     def propagate_in_video(self, inference_state: dict) -> Iterator[tuple[int, list[int], Tensor]]:
+        assert torch.is_autocast_enabled("cpu")  # its memory is bfloat16, its weights are float32
+        assert torch.get_autocast_dtype("cpu") == torch.bfloat16
         lost: set[int] = set()
         for number in range(min(inference_state["prompted"].values()), inference_state["num_frames"]):
             logits = []
