@@ -31,11 +31,11 @@ class SAM2Masks(ToMasks):
     In an environment, each step is a video of its own: the prompted frames and the frame of that moment. This is slow,
     and the predictor does not remember the steps before.
 
-    **This class has not been run with trained weights.** It is written for ``SAM2VideoPredictor`` of the package ``sam2``
-    1.1 (``device``, ``init_state``, ``add_new_points_or_box``, ``propagate_in_video``). It ran through with that package
-    and random weights, and is tested with a stand-in of this interface. How well SAM 2 finds things in images as small
-    as 64 × 64, and over the cut from the prompts to an episode, is not known here: look at the masks before you train
-    on them, and rather give it large images.
+    **This class has not been run with trained weights.** It is written for ``SAM2VideoPredictor`` of the package
+    ``sam2`` 1.1 (``device``, ``init_state``, ``add_new_points_or_box``, ``propagate_in_video``). It ran through with
+    that package and random weights, and is tested with a stand-in of this interface. How well SAM 2 finds things in
+    images as small as 64 × 64, and over the cut from the prompts to an episode, is not known here: look at the masks
+    before you train on them, and rather give it large images.
 
     Args:
         predictor: A ``SAM2VideoPredictor``, or what has its methods.
