@@ -77,6 +77,17 @@ def test_unsure_is_empty_and_hidden(frame: dict) -> None:
     assert data["object_visible"].tolist() == [False, False]
 
 
+@pytest.mark.parametrize(("pixels", "in_all"), [(1, False), (6, True)])
+def test_only_what_looks_like_a_labelled_colour_counts(pixels: int, in_all: bool) -> None:
+    """At most a level, 8 of 255, away; in red, green and blue at once only if more than one pixel says so."""
+    frame = torch.zeros(3, 8, 8, dtype=torch.uint8)
+    frame[:, 2, :pixels] = torch.tensor(RED, dtype=torch.uint8)[:, None]
+    transform = ColourMasks.fit(frame[None], (frame[None, :1] > 0))
+    for shade, expected in {(8, 0, 0): True, (0, -8, 0): True, (8, 8, 8): in_all, (16, 0, 0): False}.items():
+        other = (frame + torch.tensor(shade)[:, None, None] * (frame > 0)).to(torch.uint8)
+        assert bool(transform.segment(other).any()) == expected, shade
+
+
 def test_colours_that_are_mostly_those_of_other_things_are_nobodys() -> None:
     pixels = torch.stack([picture({(2, 3): RED, (12, 12): RED, (12, 3): RED})])
     with pytest.warns(

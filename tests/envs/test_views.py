@@ -70,6 +70,7 @@ def test_skew_rays_are_joined_at_the_middle_of_the_shortest_line_between_them() 
     ("directions", "why"),
     [
         ([[0.0, 0, 1], [0, 0, 2]], "parallel"),
+        ([[0.1, 0.2, 0.3], [0.1, 0.2, 0.3]], "parallel, with rounding errors"),
         ([[-1.0, -1, 0], [1, -1, 0]], "behind both"),
         ([[1.0, 1, 0], [1, -1, 0]], "behind one"),
         ([[0.0, 0, 0], [-1, 1, 0]], "no direction"),

@@ -15,7 +15,7 @@ from torchrl_ocwm.envs.masks import ToMasks, check_clicks, check_images
 from torchrl_ocwm.envs.missing import needs
 
 _LEVELS = 32  # of red, green and blue each
-_UNSEEN = 0.02  # pixels; a colour more than a level away from all labelled ones is nobody's
+_UNSEEN = 0.02  # pixels; what is a level away in red, green and blue weighs 1/64 for each labelled pixel
 _POOR = 0.5
 
 
