@@ -153,7 +153,8 @@ def test_colour_masks_find_more_from_more_frames(
     pytest.importorskip("cv2")
     script = benchmark("colour_masks")
     monkeypatch.setattr(script, "STEPS", 15)
-    monkeypatch.setattr(sys, "argv", ["colour_masks.py", "--envs", "reacher", "--episodes", "3", "--labelled", "1", "8"])
+    options = ["--envs", "reacher", "--episodes", "3", "--labelled", "1", "8"]
+    monkeypatch.setattr(sys, "argv", ["colour_masks.py", *options])
     script.main()
     head, _, *rows = cells(capsys.readouterr().out)
     table = {row[2]: dict(zip(head, row, strict=True)) for row in rows}
