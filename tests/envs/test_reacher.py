@@ -281,7 +281,7 @@ def test_sizes_below_one(name, value):
 
 
 def test_negative_target():
-    with pytest.raises(ValueError, match="virtual_target is a diameter in pixels, 0 for none; got -1"):
+    with pytest.raises(ValueError, match="virtual_target must be 0 or more, got -1"):
         Reacher(virtual_target=-1)
 
 

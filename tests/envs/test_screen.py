@@ -1,0 +1,88 @@
+"""What people see: pictures of any size, a window."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco.viewer
+import numpy as np
+import pytest
+
+from torchrl_ocwm.envs import Reacher
+from torchrl_ocwm.envs.opengl import RenderingError
+
+
+@pytest.fixture
+def make() -> Iterator[Callable[..., Reacher]]:
+    made: list[Reacher] = []
+
+    def one(**options: Any) -> Reacher:
+        made.append(Reacher(image_size=16, **options))
+        made[-1].reset(seed=1)
+        return made[-1]
+
+    yield one
+    for env in made:
+        env.close()
+
+
+@pytest.mark.parametrize("size", [40, 128])
+def test_a_picture_of_any_size(make: Callable[..., Reacher], size: int) -> None:
+    """It shows what the agent sees: scaled down it is nearly that."""
+    env = make(render_mode="rgb_array", render_size=size)
+    picture, small = env.render(), make(render_mode="rgb_array").render()
+    assert picture is not None
+    assert small is not None
+    assert (picture.shape, picture.dtype) == ((size, size, 3), np.uint8)
+    assert small.shape == (16, 16, 3)
+    blocks = picture[: size // 16 * 16, : size // 16 * 16].reshape(16, size // 16, 16, size // 16, 3).mean((1, 3))
+    if size % 16 == 0:
+        assert np.abs(blocks - small).mean() < 12
+    before = env.render()
+    for _ in range(5):
+        env.step(np.ones(2, np.float32))
+    assert not np.array_equal(before, env.render())
+
+
+def test_without_a_mode_there_is_nothing_to_see(make: Callable[..., Reacher]) -> None:
+    assert make(render_size=40).render() is None
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"render_mode": "ansi"}, "render_mode must be one of rgb_array, human or None, got 'ansi'"),
+        ({"render_mode": "rgb_array", "render_size": 0}, "render_size must be at least 1, got 0"),
+    ],
+)
+def test_what_there_is_not(make: Callable[..., Reacher], options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(**options)
+
+
+def test_a_window_follows_each_step(make: Callable[..., Reacher], monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+
+    def launch(model: Any, data: Any, **_: Any) -> SimpleNamespace:
+        return SimpleNamespace(sync=lambda: seen.append(data.time), close=lambda: seen.append("closed"))
+
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", launch)
+    env = make(render_mode="human")
+    env.step(np.zeros(2, np.float32))
+    env.step(np.zeros(2, np.float32))
+    assert env.render() is None
+    env.close()
+    assert seen[0] == 0  # the start
+    assert seen[0] < seen[1] < seen[2] == seen[3]
+    assert seen[4:] == ["closed"]
+
+
+def test_no_screen(make: Callable[..., Reacher], monkeypatch: pytest.MonkeyPatch) -> None:
+    def launch(*_: Any, **__: Any) -> None:
+        raise RuntimeError("could not initialize GLFW")
+
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", launch)
+    with pytest.raises(RenderingError, match="'human' needs a screen .could not initialize GLFW.; use 'rgb_array'"):
+        make(render_mode="human")
