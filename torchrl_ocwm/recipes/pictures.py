@@ -67,13 +67,15 @@ def film(
     write_video(file, tile(rows))
 
 
-def picture_episodes(agent: Agent, episodes: TensorDictBase, output: Path) -> None:
-    """What an object-centric world model sees and imagines of the objects in these episodes."""
-    if isinstance(agent.model, ObjectWorldModel):
-        records = episode_records(episodes)
-        context = min(CONTEXT, records.shape[1] - 1)
-        picture_objects(output, agent.model, records, context, agent.task.objects)
-        draw_errors(output / "errors.png", object_errors(agent.model, records, context), agent.task.objects)
+def picture_episodes(agent: Agent, episodes: TensorDictBase, output: Path) -> tuple[str, ...]:
+    """What an object-centric world model sees and imagines of the objects in these episodes; names of the files."""
+    if not isinstance(agent.model, ObjectWorldModel):
+        return ()
+    records = episode_records(episodes)
+    context = min(CONTEXT, records.shape[1] - 1)
+    picture_objects(output, agent.model, records, context, agent.task.objects)
+    draw_errors(output / "errors.png", object_errors(agent.model, records, context), agent.task.objects)
+    return ("objects.png", "objects.mp4", "errors.png")
 
 
 def _folders(sources: list[str | Path]) -> list[Path]:
