@@ -95,7 +95,7 @@ def test_a_whole_figure(work: Callable[..., list[str]], tmp_path: Path) -> None:
         assert f"![{picture}](reacher/{picture}.png)" in text
         assert (place / f"{picture}.png").stat().st_size > 1000
     assert "figure=table env=reacher size=debug seeds=1 steps=40 updates=2 goals=1" in text
-    assert "`collect.py env=reacher" in text
+    assert "`collect env=reacher" in text
     assert str(tmp_path) not in text
     record = Record.of(found[0].evaluated, tmp_path)
     assert record.machine in text

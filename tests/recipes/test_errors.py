@@ -23,6 +23,7 @@ from torchrl_ocwm.evaluation.report import ReportError
 from torchrl_ocwm.evidence import RecordError, RunFailedError
 from torchrl_ocwm.files import FolderInUseError, only_writer
 from torchrl_ocwm.parts import load_plugins
+from torchrl_ocwm.play import PlayError
 from torchrl_ocwm.processes import WorkerError
 from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.testing import random_dataset, reacher_task
@@ -42,6 +43,7 @@ KINDS = {
     MissingPackageError: ModuleNotFoundError,
     NoScriptedPolicyError: NotImplementedError,
     OutputError: RuntimeError,
+    PlayError: ValueError,
     RecordError: ValueError,
     RenderingError: RuntimeError,
     ReportError: ValueError,

@@ -45,7 +45,7 @@ def serve(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
 
 @shows("Play.agent", "Play.others", "Play.behaviour")
 def test_who_acts(serve: Callable[..., SimpleNamespace]) -> None:
-    assert serve().agents == ["reacher/scripted"]
+    assert serve().agents == ["reacher/focus_lcp"]
     seen = serve("agent=a.zip", "others=[b.zip,cube_move/scripted]", "behaviour=explore")
     assert (seen.agents, seen.behaviour) == (["a.zip", "b.zip", "cube_move/scripted"], "explore")
 

@@ -28,7 +28,7 @@ class Play(Settings):
         seed: Seeds the episodes.
     """
 
-    agent: str = "reacher/scripted"
+    agent: str = "reacher/focus_lcp"
     behaviour: str | None = None
     others: tuple[str, ...] = ()
     host: str = "127.0.0.1"
