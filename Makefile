@@ -14,7 +14,7 @@ NEXT_VERSIONS := torchrl-nightly==2026.10.27 tensordict==0.15.3
 
 export MUJOCO_GL ?= egl
 
-.PHONY: demo test test-next check clean
+.PHONY: demo test test-next docs check clean
 .DELETE_ON_ERROR:
 
 demo: check $(DEMO)/evaluation/.done
@@ -39,6 +39,10 @@ test: check
 
 test-next: $(NEXT)/.installed
 	$(NEXT)/bin/python -m pytest -q tests/modules tests/objectives torchrl_ocwm/modules torchrl_ocwm/objectives
+
+# The documentation site, in site/index.html; `make docs SERVE=1` shows it at http://127.0.0.1:8000 while you write.
+docs: $(INSTALLED)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs $(if $(SERVE),serve,build) --strict
 
 check: $(INSTALLED)
 	@$(BIN)/python -m torchrl_ocwm.check
