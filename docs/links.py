@@ -1,4 +1,4 @@
-"""A hook of MkDocs: what pages link to outside this folder is on the site too, and notebooks are pages.
+"""A hook of MkDocs: what pages link to outside this folder is on the site too, notebooks are pages, docstrings link.
 
 In the repository, pages link to ``../CONTRIBUTING.md`` or ``../examples/...``. On the site those files lie where the
 repository has them, beside what is in ``docs/``, so that one step upwards is too much.
@@ -17,6 +17,7 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
 LINK = re.compile(r"(?<=\]\()(?!\w+:)([^)#\s]+)")
+ROLE = re.compile(r":(?:func|class|meth|mod|attr|data|exc):<code>~?((?:[\w.]+\.)?(\w+))</code>")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
@@ -40,6 +41,11 @@ def add(files: Files, config: MkDocsConfig, place: str) -> None:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:  # noqa: ARG001
     """Let links lead to where things are on the site."""
     return LINK.sub(lambda link: site_link(link[0], page.file.src_uri, page.file.generated_by is not None), markdown)
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:  # noqa: ARG001
+    """Let docstrings link to what they name, where it has a place on the site."""
+    return ROLE.sub(r'<autoref identifier="\1" optional><code>\2</code></autoref>', html)
 
 
 def site_link(link: str, page: str, outside: bool) -> str:

@@ -66,6 +66,13 @@ def test_a_room_shows_all_that_it_exports(site: Path, name: str) -> None:
 
 
 @pytest.mark.slow
+def test_docstrings_link_to_what_they_name(site: Path) -> None:
+    pages = {name: (site / "api" / name / "index.html").read_text(encoding="utf-8") for name in ROOMS}
+    assert not [name for name, page in pages.items() if re.search(r":(func|class|meth|attr|data):", page)]
+    assert re.search(r'href="[^"]*load_agent[^"]*"[^>]*><code>load_agent</code></a>', pages["agents"])
+
+
+@pytest.mark.slow
 def test_every_room_has_a_page() -> None:
     rooms = {file.parent.name for file in (ROOT / "torchrl_ocwm").glob("*/__init__.py")}
     assert {"torchrl_ocwm", *rooms} == set(ROOMS)
