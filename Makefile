@@ -22,6 +22,7 @@ demo: check $(DEMO)/evaluation/.done
 	@cat $(DEMO)/evaluation/results.md
 	@echo
 	@echo "Where to look, all in $(DEMO):"
+	@echo "  evaluation/report.html                all that follows on one page for the browser"
 	@echo "  evaluation/results.md, results.json   table and numbers, goal by goal"
 	@echo "  evaluation/heatmap.png                score over the workspace: random actions, position goals, image goals"
 	@echo "  evaluation/learning_curve.png         scores and losses while it learnt"

@@ -67,9 +67,9 @@ def test_tensorboard_shows_videos(tmp_path: Path) -> None:
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     [event] = events.Images("open_loop")
-    assert (event.step, event.height, event.width) == (7, 30, 45)
+    assert (event.step, event.height, event.width) == (7, 20, 30)
     frames = imageio.imread(event.encoded_image_string, extension=".gif", index=None)
-    assert frames.shape == (3, 30, 45, 3)
+    assert frames.shape == (3, 20, 30, 3)
     assert frames.mean((1, 2)).argmax(-1).tolist() == [0, 1, 2]
 
 
