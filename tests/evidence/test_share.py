@@ -15,6 +15,7 @@ from torchrl_ocwm.agents import build_agent
 from torchrl_ocwm.envs import make_task
 from torchrl_ocwm.evaluation import Report
 from torchrl_ocwm.evidence import Collected, Evaluated, Record, RecordError, Trained, share
+from torchrl_ocwm.testing import reacher_task
 
 
 @pytest.fixture
@@ -47,9 +48,8 @@ def test_agent_and_card(evaluated: Path, tmp_path: Path) -> None:
     assert "30 scripted steps and 12 random steps, seed 0" in card
     assert "1,200 updates, seed 3, 3 min" in card
     assert "a fast one, 2 cores" in card
-    assert "| commit | abc |" in card
+    assert "| commit | abc, evaluated at def |" in card
     assert "1 goals on a grid over the workspace, 7 steps each" in card
-    assert "evaluated at commit def" in card
     assert "| dreamer_pcp | 1 | 0.75 |" in card
 
 
@@ -57,6 +57,18 @@ def test_runs_may_have_been_moved(evaluated: Path, tmp_path: Path) -> None:
     shutil.move(tmp_path / "runs", tmp_path / "moved")
     share(tmp_path / "moved" / "evaluations" / evaluated.name, tmp_path / "shared")
     assert (tmp_path / "shared" / "agent.zip").exists()
+
+
+def test_a_setting_may_have_come_between(evaluated: Path, tmp_path: Path) -> None:
+    [training] = (evaluated.parents[1] / "trainings").iterdir()
+    record = Record.read(training / "run.json")
+    del record.content["agent"]["world_model"]["predicted"]
+    record.write(training)
+    assert (share(evaluated, tmp_path / "shared") / "agent.zip").exists()
+    record.content["training"]["seed"] = 4
+    record.write(training)
+    with pytest.raises(RecordError, match="its training is not in"):
+        share(evaluated, tmp_path / "shared")
 
 
 def test_an_evaluation_that_is_not_done(evaluated: Path, tmp_path: Path) -> None:
@@ -77,7 +89,43 @@ def test_an_evaluation_without_its_training(evaluated: Path, tmp_path: Path) -> 
         share(evaluated, tmp_path / "shared")
 
 
+@pytest.fixture
+def plain(tmp_path: Path) -> Path:
+    """What ``train-online`` and ``evaluate`` leave."""
+    run = tmp_path / "run"
+    save_agent(build_agent("dreamer_pcp", reacher_task(), "debug"), run / "checkpoint.zip")
+    (run / "config.yaml").write_text(
+        "training: {updates: 1500, seed: 4}\n"
+        "online: {seed_steps: [70, 30], seed_policy: [scripted, random], update_ratio: 0.5}\n"
+    )
+    report = Report(torch.zeros(1, 2), {"goals": 1, "episode_steps": 7})
+    report.add("random", {"final_score": torch.tensor([0.25])}, source="smooth actions")
+    report.add("dreamer_pcp", {"final_score": torch.tensor([0.75])}, source=run / "checkpoint.zip")
+    report.save(tmp_path / "evaluation")
+    return tmp_path / "evaluation"
+
+
+def test_runs_of_other_commands(plain: Path, tmp_path: Path) -> None:
+    card = (share(plain, tmp_path / "shared") / "README.md").read_text()
+    assert load_agent(tmp_path / "shared").agent.task == reacher_task()
+    assert "| training | 1,500 updates, seed 4 |" in card
+    assert "| data | 70 scripted steps and 30 random steps, and then its own, 0.5 updates per step |" in card
+    (tmp_path / "run" / "config.yaml").write_text("training: {updates: 1500, seed: 4}\n")
+    assert "| data |" not in (share(plain, tmp_path / "shared") / "README.md").read_text()
+
+
+def test_what_is_missing_of_them(plain: Path, tmp_path: Path) -> None:
+    (tmp_path / "run" / "config.yaml").unlink()
+    with pytest.raises(RecordError, match=r"config\.yaml: no such file"):
+        share(plain, tmp_path / "shared")
+    report = Report.load(plain / "results.json")
+    report.add("other", {"final_score": torch.tensor([0.75])}, source=tmp_path / "other.zip")
+    report.save(plain)
+    with pytest.raises(RecordError, match="is of 2 checkpoints; evaluate the one to share alone"):
+        share(plain, tmp_path / "shared")
+
+
 def test_the_recipe(evaluated: Path, tmp_path: Path, command: Callable[..., str]) -> None:
     assert str(tmp_path / "new") in command("share", f"evaluation={evaluated}", f"output={tmp_path}/new", "name=a/b")
     assert "# a/b" in (tmp_path / "new" / "README.md").read_text()
-    assert "not the record of a run" in command("share", f"evaluation={tmp_path}")
+    assert "not the results.json of an evaluation" in command("share", f"evaluation={tmp_path}")

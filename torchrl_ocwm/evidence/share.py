@@ -5,8 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from omegaconf import OmegaConf
+
 from torchrl_ocwm.agents import agent_name, load_agent, save_agent
 from torchrl_ocwm.agents.agent import Agent
+from torchrl_ocwm.agents.presets import flat
 from torchrl_ocwm.agents.sources import AGENT_FILE
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.report import Report
@@ -18,10 +21,10 @@ CARD = "README.md"
 
 
 def share(evaluation: Path, folder: Path, *, name: str | None = None) -> Path:
-    """Put the agent of an evaluation of ``reproduce`` into a folder, for :func:`~torchrl_ocwm.load_agent`.
+    """Put the agent of an evaluation into a folder, for :func:`~torchrl_ocwm.load_agent`.
 
     Args:
-        evaluation: Folder of the evaluation, among those of all runs.
+        evaluation: Folder of the evaluation of one agent: one of ``reproduce``, or what ``evaluate`` wrote.
         folder: Where ``agent.zip``, without the optimiser's state, and its card ``README.md`` go. It can be uploaded to
             the Hugging Face Hub as it is.
         name: What others load it by; by default the folder's path.
@@ -30,48 +33,73 @@ def share(evaluation: Path, folder: Path, *, name: str | None = None) -> Path:
         The folder.
 
     Raises:
-        RecordError: if the evaluation is not done, or its training is not beside it.
+        RecordError: if the evaluation is not done, or its training is not where it was.
         CheckpointError: if the checkpoint cannot be read, or the agent cannot be written.
         ReportError: if the results cannot be read.
         OutputError: if the card cannot be written.
     """
-    record = Record.read(evaluation / RECORD)
-    if not record.done or "trained" not in record.content:
-        raise RecordError(f"{evaluation}: not an evaluation that is done")
-    training = _training(evaluation, record)
-    agent = load_agent(training / CHECKPOINT).agent
-    report = Report.load(evaluation / "results.json")
-    card = _card(name or str(folder), agent, record, Record.read(training / RECORD), report)
+    checkpoint, facts = _of_reproduce(evaluation) if (evaluation / RECORD).exists() else _of_evaluate(evaluation)
+    agent, report = load_agent(checkpoint).agent, Report.load(evaluation / "results.json")
+    card = _card(name or str(folder), agent, facts, report)
     save_agent(agent, folder / AGENT_FILE)
     with writing(folder / CARD) as file:
         file.write_text(card, encoding="utf-8")
     return folder
 
 
-def _training(evaluation: Path, record: Record) -> Path:
-    """The training of the same content, wherever all runs have been moved to."""
+def _of_reproduce(evaluation: Path) -> tuple[Path, dict[str, str]]:
+    """The checkpoint, and what is known of its training, which lies beside, wherever all runs have been moved to."""
+    record = Record.read(evaluation / RECORD)
+    if not record.done or "trained" not in record.content:
+        raise RecordError(f"{evaluation}: not an evaluation that is done")
     for folder in sorted((evaluation.parents[1] / "trainings").glob("*")):
-        if (folder / RECORD).exists() and Record.read(folder / RECORD).content == record.content["trained"]:
-            return folder
-    raise RecordError(f"{evaluation}: its training is not in {evaluation.parents[1] / 'trainings'}")
-
-
-def _card(name: str, agent: Agent, evaluated: Record, trained: Record, report: Report) -> str:
-    task, data, training = agent.task, trained.content["data"], trained.content["training"]
-    row = agent_name(agent.config)
-    steps = (
-        " and ".join(f"{count:,} {policy} steps" for policy, count in data.get("policies", [])) or "an explorer's steps"
-    )
-    facts = {
-        "agent": f"`{row}`",
-        "environment": f"`{task.name}`, {_written(task.options)}",
-        "parameters": f"{sum(one.numel() for one in agent.model.parameters()):,} in the world model",
-        "data": f"{steps}, seed {data['seed']}",
+        if (folder / RECORD).exists() and _agree((trained := Record.read(folder / RECORD)).content, record.content):
+            break
+    else:
+        raise RecordError(f"{evaluation}: its training is not in {evaluation.parents[1] / 'trainings'}")
+    data, training = trained.content["data"], trained.content["training"]
+    steps = " and ".join(f"{count:,} {policy} steps" for policy, count in data.get("policies", []))
+    return folder / CHECKPOINT, {
+        "data": f"{steps or 'steps of an explorer'}, seed {data['seed']}",
         "training": f"{training['updates']:,} updates, seed {training['seed']}, {in_words(trained.seconds)}",
         "machine": trained.machine,
-        "commit": trained.commit,
+        "commit": f"{trained.commit}, evaluated at {record.commit}",
     }
-    settings = report.settings
+
+
+def _agree(trained: dict[str, Any], evaluated: dict[str, Any]) -> bool:
+    """Whether an evaluation is of that training; a setting that only one of them has came with a release between."""
+    one, other = flat(trained), flat(evaluated["trained"])
+    return all(one[name] == other[name] for name in one.keys() & other.keys())
+
+
+def _of_evaluate(evaluation: Path) -> tuple[Path, dict[str, str]]:
+    """The checkpoint, and what the settings beside it say."""
+    sources = [one for row in Report.load(evaluation / "results.json").rows.values() for one in row.sources]
+    files = list(dict.fromkeys(one for one in sources if isinstance(one, Path)))
+    if len(files) != 1:
+        raise RecordError(f"{evaluation}: is of {len(files)} checkpoints; evaluate the one to share alone")
+    settings = files[0].parent / "config.yaml"
+    if not settings.exists():
+        raise RecordError(f"{settings}: no such file; the card says what it has of the training")
+    config: Any = OmegaConf.to_container(OmegaConf.load(settings))
+    training, online = config["training"], config.get("online")
+    facts = {"training": f"{training['updates']:,} updates, seed {training['seed']}"}
+    if online is not None:
+        seeded = zip(online["seed_steps"], online["seed_policy"], strict=True)
+        first = " and ".join(f"{count:,} {policy} steps" for count, policy in seeded)
+        facts["data"] = f"{first}, and then its own, {online['update_ratio']} updates per step"
+    return files[0], facts
+
+
+def _card(name: str, agent: Agent, more: dict[str, str], report: Report) -> str:
+    task, settings = agent.task, report.settings
+    facts = {
+        "agent": f"`{agent_name(agent.config)}`",
+        "environment": f"`{task.name}`, {_written(task.options)}",
+        "parameters": f"{sum(one.numel() for one in agent.model.parameters()):,} in the world model",
+        **more,
+    }
     return "\n".join(
         [
             "---",
@@ -96,7 +124,7 @@ def _card(name: str, agent: Agent, evaluated: Record, trained: Record, report: R
             *(f"| {what} | {value} |" for what, value in facts.items()),
             "",
             f"{settings['goals']} goals on a grid over the workspace, {settings['episode_steps']} steps each, starts "
-            f"that no training saw, evaluated at commit {evaluated.commit}:",
+            "that no training saw:",
             "",
             report.markdown(),
             "",

@@ -19,7 +19,7 @@ class Share(Settings):
     """Settings of the recipe.
 
     Args:
-        evaluation: Folder of an evaluation that reproduce has made.
+        evaluation: Folder of an evaluation of one agent, of reproduce or evaluate.
         output: Folder for the agent and its card.
         name: What others load it by; none: the output folder.
     """
