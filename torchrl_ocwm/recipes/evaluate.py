@@ -96,8 +96,7 @@ def main(config: Evaluate) -> None:
                 report.add(name + kind, scores, **run)
     report.save(output)
     print(report.markdown())
-    draw(report, task, output)
-    drawn = ["heatmap.png", "learning_curve.png"]
+    drawn = [*draw(report, task, output)]
     if settings.video_goals:
         films = {kind: footage[kind].episodes() for kind in goal_kinds(policies[-1], settings.image_goals)}
         for kind, episodes in films.items():

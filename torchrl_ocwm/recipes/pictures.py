@@ -39,13 +39,14 @@ CURVES = {
 }
 
 
-def draw(report: Report, task: Task, output: Path) -> None:
-    """Scores over the workspace, and how the agents of each row learnt."""
+def draw(report: Report, task: Task, output: Path) -> list[str]:
+    """Scores over the workspace, and how the agents of each row learnt, if that was logged; names of the files."""
     heatmap(output / "heatmap.png", report.per_goal("final_score"), task.workspace, title="final score")
     runs: dict[str, list[Path]] = {}
     for name, row in report.rows.items():
         runs.setdefault(name.removesuffix(IMAGE_GOALS), _folders(row.sources))
-    learning_curves(output / "learning_curve.png", runs, CURVES)
+    learnt = learning_curves(output / "learning_curve.png", runs, CURVES)
+    return ["heatmap.png", *["learning_curve.png"] * bool(learnt)]
 
 
 def film(
