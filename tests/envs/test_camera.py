@@ -276,3 +276,11 @@ def test_closing_a_camera_leaves_the_others_alone(open_camera, model, data):
     after = first.render(data, depth=True)
     for old, new in zip(before, after, strict=True):
         assert np.array_equal(old, new)
+
+
+def test_a_fine_picture_is_that_of_a_larger_camera(open_camera, data):
+    camera, large = open_camera(mask_scale=3), open_camera(height=3 * HEIGHT, width=3 * WIDTH)
+    assert np.array_equal(camera.picture(data, fine=True), large.picture(data))
+    frame = camera.render(data)  # which uses the same buffers
+    assert np.array_equal(frame.geoms, large.render(data).geoms)
+    assert np.array_equal(frame.pixels, open_camera().picture(data))

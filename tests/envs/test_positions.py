@@ -287,7 +287,7 @@ def test_transform_names_the_missing_key(transform, missing):
 
 def test_transform_moves_with_its_cameras():
     transform = MaskToPosition(SMALL.double(), TOP.double(), plane=FLOOR)
-    assert {name for name, _ in transform.named_buffers()} == {"intrinsics", "extrinsics", "plane", "start"}
+    assert {name for name, _ in transform.named_buffers()} == {"view.intrinsics", "view.extrinsics", "plane", "start"}
     assert transform(TensorDict({"masks": one_pixel(2)[None]}, [1]))["object_position"].dtype == torch.float32
 
 

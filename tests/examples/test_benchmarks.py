@@ -145,3 +145,21 @@ def test_speed_of_an_evaluation_adds_up(tmp_path: Path) -> None:
     shares = {name: float(share) for name, _, share in rows[:-2]}
     assert all(0 <= share <= 1 for share in shares.values())
     assert min(seconds["writing of videos"], seconds["everything else, such as imports"]) > 0
+
+
+def test_colour_masks_find_more_from_more_frames(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("cv2")
+    script = benchmark("colour_masks")
+    monkeypatch.setattr(script, "STEPS", 15)
+    options = ["--envs", "reacher", "--episodes", "3", "--labelled", "1", "8"]
+    monkeypatch.setattr(sys, "argv", ["colour_masks.py", *options])
+    script.main()
+    head, _, *rows = cells(capsys.readouterr().out)
+    table = {row[2]: dict(zip(head, row, strict=True)) for row in rows}
+    assert list(table) == ["1 labelled", "1 clicked", "8 labelled", "8 clicked"]
+    assert 2 < float(table["1 labelled"]["pixels of the object"]) < 6
+    assert float(table["8 labelled"]["IoU"]) > max(0.5, float(table["1 labelled"]["IoU"]))
+    assert float(table["8 labelled"]["centroid, median"]) < 0.5
+    assert {row["removed"] for row in table.values()} == {"0.0%"}

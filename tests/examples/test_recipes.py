@@ -48,9 +48,10 @@ def train(dataset: Path, output: Path, *arguments: str) -> Path:
 
 def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     files = [train(dataset, tmp_path / "pcp", "agent=dreamer_pcp", "training.loggers=[tensorboard]")]
+    here = "training.eval_beside=false"
     for seed in (0, 1):
-        files.append(train(dataset, tmp_path / f"dreamer_{seed}", "agent=dreamer", f"training.seed={seed}"))
-    files.append(train(dataset, tmp_path / "lcp", "agent=focus_lcp"))
+        files.append(train(dataset, tmp_path / f"dreamer_{seed}", "agent=dreamer", f"training.seed={seed}", here))
+    files.append(train(dataset, tmp_path / "lcp", "agent=focus_lcp", here))
     assert (tmp_path / "pcp" / "videos" / "open_loop_0000004.mp4").stat().st_size > 1000
     [events] = (tmp_path / "pcp" / "tensorboard").iterdir()
     assert b"open_loop" in events.read_bytes()

@@ -80,6 +80,49 @@ def test_virtual_target() -> None:
                 assert np.hypot(columns.mean() + 0.5 - goal[0], rows.mean() + 0.5 - goal[1]) < 1
 
 
+@shows("EnvOptions.labelled_frames")
+@pytest.mark.parametrize("mask_scale", [1, 3])
+def test_labelled_frames(mask_scale: int) -> None:
+    """Objects are found by their colours: where the simulator has them, but not once their colour is another one."""
+    pytest.importorskip("cv2")
+    with simulator(image_size=64, mask_scale=mask_scale) as true:
+        expected = true._observe(true.data)
+        with simulator(image_size=64, mask_scale=mask_scale, labelled_frames=5) as scene:
+            found = scene._observe(scene.data)
+            assert np.array_equal(found["pixels"], expected["pixels"])
+            overlap = (found["masks"] & expected["masks"]).sum() / (found["masks"] | expected["masks"]).sum()
+            assert overlap >= 0.5
+            assert np.abs(found["object_position"] - expected["object_position"]).max() < 0.01  # a pixel
+            for model in (scene.model, true.model):
+                model.mat_rgba[model.geom("finger").matid] = (0, 1, 0, 1)
+            assert true._observe(true.data)["object_visible"].tolist() == [True]
+            assert scene._observe(scene.data)["object_visible"].tolist() == [False]
+
+
+def test_environments_that_learnt_colours_start_as_others_do() -> None:
+    """What was drawn to learn them leaves no trace in episodes, nor in those without a seed."""
+    pytest.importorskip("cv2")
+    starts = []
+    for frames in (0, 2):
+        with closing(gymnasium.make(ENVIRONMENTS["reacher"].id, image_size=64, labelled_frames=frames)) as env:
+            starts.append(env.reset(seed=3)[0]["proprio"])
+    assert np.array_equal(*starts)
+    unseeded = []
+    for _ in range(2):
+        with closing(gymnasium.make(ENVIRONMENTS["reacher"].id, image_size=64, labelled_frames=2)) as env:
+            unseeded.append(env.reset()[0]["proprio"])
+    assert not np.array_equal(*unseeded)
+
+
+def test_datasets_and_agents_of_earlier_releases_fit_the_default(tmp_path: Path) -> None:
+    with_it = {**OPTIONS, "labelled_frames": 0}
+    assert make_task("reacher", **OPTIONS) == make_task("reacher", **with_it)
+    collect(tmp_path / "data", "reacher", Collection(steps=5, workers=0), options=OPTIONS, progress=False)
+    more = collect(tmp_path / "data", "reacher", Collection(steps=10, workers=0), options=with_it, progress=False)
+    assert more.num_steps == 10
+    assert make_task("reacher", **OPTIONS) != make_task("reacher", image_size=64, labelled_frames=2)
+
+
 @shows("CubeMoveOptions.objects", "CubeMoveOptions.horizon", "CubeMoveOptions.mask_scale")
 def test_cube_move() -> None:
     with simulator("cube_move", horizon=2, mask_scale=2, objects=("cube", "distractor")) as scene:

@@ -12,6 +12,7 @@ from torchrl_ocwm.data.records import STORED, episode_to_records
 from torchrl_ocwm.data.relabel import RelabelGoals
 from torchrl_ocwm.data.replay import make_replay_buffer
 from torchrl_ocwm.data.settings import Collection
+from torchrl_ocwm.data.transformed import transform_dataset
 
 __all__ = [
     "STORED",
@@ -36,5 +37,6 @@ __all__ = [
     "object_coverage",
     "object_positions",
     "release_pages",
+    "transform_dataset",
     "with_coverage",
 ]

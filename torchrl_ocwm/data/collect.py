@@ -28,6 +28,7 @@ from torchrl_ocwm.data.seeds import episode_seed
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.envs import ScriptedAction, Task, find_environment, make_env, make_task
 from torchrl_ocwm.envs.missing import needs
+from torchrl_ocwm.envs.registry import recorded
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.processes import Make, Worker, make_worker
 from torchrl_ocwm.settings import SettingsError
@@ -92,7 +93,7 @@ def collect(
 
     if isinstance(settings, int):
         settings = Collection(steps=settings, **more)
-    options = options or {}
+    options = recorded(options or {})
     task = make_task(environment, **options)
     source = {"environment": task.name, "options": options, "task": task.to_dict()}
     name, module = _who_acts(settings, policy, task)

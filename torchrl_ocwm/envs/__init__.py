@@ -10,9 +10,13 @@ from torchrl_ocwm.envs.opengl import import_mujoco
 if find_spec("mujoco") is not None:
     import_mujoco()  # TorchRL imports it too, and would fail without saying what is missing
 
+from torchrl_ocwm.envs.calibration import Calibration, CalibrationError, camera_to_world
+from torchrl_ocwm.envs.colour_masks import ColourMasks, largest_component
 from torchrl_ocwm.envs.goal_env import GoalEnv
+from torchrl_ocwm.envs.mask_to_position import MaskToPosition, View, ViewsToPosition
 from torchrl_ocwm.envs.options import EnvOptions
-from torchrl_ocwm.envs.positions import MaskToPosition, hold_last_seen, mask_centroid, masks_to_positions
+from torchrl_ocwm.envs.positions import hold_last_seen, mask_centroid, masks_to_positions
+from torchrl_ocwm.envs.rays import intersect_rays, undistort
 from torchrl_ocwm.envs.registry import (
     ENVIRONMENTS,
     EnvChoice,
@@ -23,6 +27,7 @@ from torchrl_ocwm.envs.registry import (
     make_task,
     register_environment,
 )
+from torchrl_ocwm.envs.sam2_masks import SAM2Masks
 from torchrl_ocwm.envs.scripted import ScriptedAction
 from torchrl_ocwm.envs.task import ActionRange, Task
 from torchrl_ocwm.envs.workspace import Workspace
@@ -39,7 +44,10 @@ if TYPE_CHECKING:
 __all__ = [
     "ENVIRONMENTS",
     "ActionRange",
+    "Calibration",
+    "CalibrationError",
     "Camera",
+    "ColourMasks",
     "CubeMove",
     "EnvChoice",
     "EnvOptions",
@@ -51,19 +59,26 @@ __all__ = [
     "PositioningEnv",
     "Reacher",
     "RecordedEnv",
+    "SAM2Masks",
     "ScriptedAction",
     "ShelfPlace",
     "SimulationDivergedError",
     "Task",
+    "View",
+    "ViewsToPosition",
     "Workspace",
+    "camera_to_world",
     "find_environment",
     "hold_last_seen",
+    "intersect_rays",
+    "largest_component",
     "make_env",
     "make_scene",
     "make_task",
     "mask_centroid",
     "masks_to_positions",
     "register_environment",
+    "undistort",
 ]
 
 # These need a simulator, so they are imported when they are asked for.

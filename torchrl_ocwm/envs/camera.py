@@ -147,8 +147,13 @@ class Camera:
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
         return Frame(pixels, self._geoms(), self._metres() if depth else None)
 
-    def picture(self, data: mujoco.MjData) -> np.ndarray:
-        """Render the colours alone, ``[H, W, 3]`` uint8: the first pass of :meth:`render`."""
+    def picture(self, data: mujoco.MjData, *, fine: bool = False) -> np.ndarray:
+        """Render the colours alone, ``[H, W, 3]`` uint8: the first pass of :meth:`render`.
+
+        Args:
+            data: A state of the camera's model.
+            fine: As large as the segmentation, ``[S * H, S * W, 3]``.
+        """
         if self._context is None:
             raise RuntimeError("this camera is closed")
         self._make_current()
@@ -156,9 +161,10 @@ class Camera:
         mujoco.mjv_updateScene(self.model, data, self._options, None, self._view, everything, self._scene)
         if self._scene.ngeom > self._max_geoms:
             raise ValueError(f"the scene has more than {self._max_geoms} geoms; give the camera a larger max_geoms")
-        mujoco.mjr_render(self._rectangle, self._scene, self._context)
-        mujoco.mjr_readPixels(self._pixels, None, self._rectangle, self._context)
-        return self._pixels[::-1].copy()  # OpenGL's rows run upwards
+        size, buffer = (self._fine, self._ids) if fine else (self._rectangle, self._pixels)
+        mujoco.mjr_render(size, self._scene, self._context)
+        mujoco.mjr_readPixels(buffer, None, size, self._context)
+        return buffer[::-1].copy()  # OpenGL's rows run upwards
 
     def _make_current(self) -> None:
         if threading.current_thread() is not self._thread:

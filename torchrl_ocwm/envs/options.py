@@ -20,6 +20,8 @@ class EnvOptions(Settings):
         action_repeat: Simulator control steps per step.
         mask_scale: How many times finer than the images the segmentation is that positions are read from.
         virtual_target: Diameter in pixels of a disc drawn at the goal, 0 for none.
+        labelled_frames: The simulator labels so many frames, and from then on objects are found by their colours
+            (`ColourMasks`); 0 for the simulator's masks at every step.
     """
 
     image_size: int = setting(64, at_least=1, at_most=4096)
@@ -27,6 +29,7 @@ class EnvOptions(Settings):
     action_repeat: int = setting(2, at_least=1)
     mask_scale: int = setting(1, at_least=1, at_most=64)
     virtual_target: int = setting(0, at_least=0)
+    labelled_frames: int = setting(0, at_least=0)
 
     def validate(self) -> None:
         """The segmentation fits into the buffers of OpenGL."""

@@ -11,7 +11,8 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from torchrl_ocwm.envs.camera import Camera
+from torchrl_ocwm.envs.camera import Camera, Frame
+from torchrl_ocwm.envs.colour_masks import ColourMasks
 from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.positions import masks_to_positions
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
@@ -61,6 +62,8 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         mask_scale: How many times finer than the images the segmentation is that positions are read from, in height and
             width. ``masks`` are samples of it, as large as the images.
         virtual_target: Diameter in pixels of a disc drawn at the goal, 0 for none (paper, "Size matters!").
+        labelled_frames: The simulator labels so many frames, and from then on objects are found by their colours
+            (:class:`~torchrl_ocwm.envs.ColourMasks`), as with a real camera; 0 for the simulator's masks at every step.
         camera_options: Passed to :class:`~torchrl_ocwm.envs.Camera`: shadows, reflections, multisampling, max_geoms.
         privileged: Add ``object_position_true`` to the observations.
         render_mode: ``"rgb_array"`` makes :meth:`render` return the camera image (H, W, 3).
@@ -91,6 +94,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     #: How far the middle of an object lies behind its visible surface, metres along the optical axis.
     depth_offset: ClassVar[float] = 0.0
     blind: bool = False
+    _colour_masks: ColourMasks | None = None
     _made_with: partial[PositioningEnv]
 
     def __init__(
@@ -101,6 +105,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         action_repeat: int = 2,
         mask_scale: int = 1,
         virtual_target: int = 0,
+        labelled_frames: int = 0,
         camera_options: dict[str, Any] | None = None,
         privileged: bool = False,
         render_mode: str | None = None,
@@ -114,8 +119,9 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         for name, value in counts.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
-        if virtual_target < 0:
-            raise ValueError(f"virtual_target is a diameter in pixels, 0 for none; got {virtual_target}")
+        for name, value in {"virtual_target": virtual_target, "labelled_frames": labelled_frames}.items():
+            if value < 0:
+                raise ValueError(f"{name} must be 0 or more, got {value}")
         self.image_size, self.horizon, self.action_repeat = image_size, horizon, action_repeat
         self.mask_scale, self.virtual_target, self.render_mode = mask_scale, virtual_target, render_mode
         self.privileged = privileged
@@ -134,6 +140,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         self._mask_intrinsics = self._intrinsics * torch.tensor([[mask_scale], [mask_scale], [1.0]])
         self.observation_space = self._observation_space()  # type: ignore[assignment]
         self.action_space = spaces.Box(-1.0, 1.0, self._action_shape(), np.float32)
+        self._colour_masks = self._learn_colours(labelled_frames) if labelled_frames else None
 
     def __new__(cls, *arguments: Any, **options: Any) -> PositioningEnv:
         """Keep what it is made with, to make it again where it is unpickled."""
@@ -387,7 +394,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def _look(self, data: mujoco.MjData, goal: np.ndarray) -> _Seen:
         frame = self.camera.render(data, depth=self._plane is None)
-        fine_masks = np.array([_any_of(frame.geoms, ids) for ids in self._geom_ids])
+        fine_masks = self._segment(frame, data)
         masks = fine_masks[:, self.mask_scale // 2 :: self.mask_scale, self.mask_scale // 2 :: self.mask_scale]
         world, visible = masks_to_positions(
             torch.from_numpy(fine_masks),
@@ -398,6 +405,27 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         )
         pixels = self._paint_target(frame.pixels, masks.any(0), goal, data).transpose(2, 0, 1)
         return pixels, masks.copy(), self._relative(world.numpy()), visible.numpy()
+
+    def _segment(self, frame: Frame, data: mujoco.MjData) -> np.ndarray:
+        """Masks (O, S * H, S * W), by colour if colours were learnt."""
+        if self._colour_masks is None:
+            return np.array([_any_of(frame.geoms, ids) for ids in self._geom_ids])
+        return self._colour_masks.segment(self._fine_picture(data)).numpy()
+
+    def _fine_picture(self, data: mujoco.MjData) -> torch.Tensor:
+        return torch.from_numpy(self.camera.picture(data, fine=True)).movedim(-1, 0)
+
+    def _learn_colours(self, frames: int) -> ColourMasks:
+        """From goal observations of each object in turn, always the same."""
+        places = np.random.default_rng(0).uniform(self.workspace.low, self.workspace.high, (frames, self.workspace.dim))
+        self.reset(seed=0)
+        pixels, masks = [], []
+        for number, place in enumerate(places):
+            self.goal_observation(place, number % len(self.objects))
+            pixels.append(self._fine_picture(self._scratch))
+            masks.append(torch.from_numpy(self._segment(self.camera.render(self._scratch), self._scratch)))
+        self._np_random = self._np_random_seed = None  # a reset without a seed is random, as ever
+        return ColourMasks.fit(torch.stack(pixels), torch.stack(masks))
 
     def _nothing(self) -> _Seen:
         shape, objects = (self.image_size, self.image_size), len(self.objects)

@@ -163,7 +163,7 @@ def make_env(
         seed: Seeds the environments, each differently.
         device: Where observations are put.
         options: Passed to the environment: image_size, horizon, action_repeat, mask_scale, virtual_target,
-            camera_options, privileged.
+            labelled_frames, camera_options, privileged.
 
     Returns:
         An environment with the keys of the data contract (docs/data.md) and ``is_init``. The goal of an episode can be
@@ -207,8 +207,22 @@ def make_task(name: str, **options: Any) -> Task:
             proprio=space["proprio"].shape[0],
             action=scene.action_space.shape[0],
             workspace=scene.workspace,
-            options={key: value for key, value in options.items() if key not in ("horizon", "privileged")},
+            options={key: value for key, value in recorded(options).items() if key not in ("horizon", "privileged")},
         )
+
+
+#: Options that earlier releases did not have, with what these did.
+_LATER = {"labelled_frames": 0}
+
+
+def recorded(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options as datasets and tasks keep them, so that those of earlier releases stay equal to new ones.
+
+    Examples:
+        >>> recorded({"image_size": 64, "labelled_frames": 0})
+        {'image_size': 64}
+    """
+    return {name: value for name, value in options.items() if name not in _LATER or value != _LATER[name]}
 
 
 def make_scene(environment: Environment, **options: Any) -> Any:
