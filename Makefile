@@ -14,7 +14,7 @@ NEXT_VERSIONS := torchrl-nightly==2026.10.27 tensordict==0.15.3
 
 export MUJOCO_GL ?= egl
 
-.PHONY: demo test test-next check clean
+.PHONY: demo test test-next docs check clean
 .DELETE_ON_ERROR:
 
 demo: check $(DEMO)/evaluation/.done
@@ -22,6 +22,7 @@ demo: check $(DEMO)/evaluation/.done
 	@cat $(DEMO)/evaluation/results.md
 	@echo
 	@echo "Where to look, all in $(DEMO):"
+	@echo "  evaluation/report.html                all that follows on one page for the browser"
 	@echo "  evaluation/results.md, results.json   table and numbers, goal by goal"
 	@echo "  evaluation/heatmap.png                score over the workspace: random actions, position goals, image goals"
 	@echo "  evaluation/learning_curve.png         scores and losses while it learnt"
@@ -39,6 +40,10 @@ test: check
 
 test-next: $(NEXT)/.installed
 	$(NEXT)/bin/python -m pytest -q tests/modules tests/objectives torchrl_ocwm/modules torchrl_ocwm/objectives
+
+# The documentation site, in site/index.html; `make docs SERVE=1` shows it at http://127.0.0.1:8000 while you write.
+docs: $(INSTALLED)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs $(if $(SERVE),serve,build) --strict
 
 check: $(INSTALLED)
 	@$(BIN)/python -m torchrl_ocwm.check

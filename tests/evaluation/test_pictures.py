@@ -50,11 +50,13 @@ def test_learning_curves(tmp_path: Path) -> None:
     assert steps.tolist() == [10, 20]
     assert values.tolist() == [2.0, 3.0]
     runs = {"agent": [tmp_path / "seed_0", tmp_path / "seed_1"]}
-    learning_curves(tmp_path / "curves.png", runs, {"evaluation/score": "score"})
+    assert learning_curves(tmp_path / "curves.png", runs, {"evaluation/score": "score"})
     image = imageio.imread(tmp_path / "curves.png")
     assert image.std() > 1
     learning_curves(tmp_path / "more.png", runs, {"evaluation/score": "score", "missing": "nothing"})
     np.testing.assert_array_equal(imageio.imread(tmp_path / "more.png"), image)  # no panel for what nobody logged
+    assert not learning_curves(tmp_path / "none.png", {"agent": [tmp_path / "none"]}, {"evaluation/score": "score"})
+    assert not (tmp_path / "none.png").exists()
 
 
 def test_video_is_readable(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -49,9 +50,13 @@ def test_shows_what_the_world_model_has(dataset: EpisodeDataset, tmp_path: Path,
     file = checkpoint(name, tmp_path)
     printed = diagnose(f"checkpoint={file}", f"dataset={dataset.path}", f"output={output}", *SMALL)
     files = {file.name: file for file in output.iterdir() if file.is_file()}
-    assert set(files) == pictures | {"diagnosis.json", "diagnosis.md"}
+    assert set(files) == pictures | {"diagnosis.json", "diagnosis.md", "report.html"}
     assert all(files[picture].stat().st_size > 1000 for picture in pictures)
+    page = files["report.html"].read_text()
+    assert len(re.findall(r'src="data:(?:image/png|video/mp4);base64,', page)) == page.count("src=") == len(pictures)
+    assert "http" not in page
     table = files["diagnosis.md"].read_text()
+    assert all(f"<td>{cell.strip()}</td>" in page for cell in table.splitlines()[2].strip("|").split("|"))
     assert table in printed
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
     shown = [row for row in rows if row[0] == "finger"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -52,7 +53,9 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
         files.append(train(dataset, tmp_path / f"dreamer_{seed}", "agent=dreamer", f"training.seed={seed}", here))
     files.append(train(dataset, tmp_path / "lcp", "agent=focus_lcp", here))
     assert (tmp_path / "pcp" / "videos" / "open_loop_0000004.mp4").stat().st_size > 1000
-    assert list((tmp_path / "pcp" / "tensorboard").iterdir())
+    [events] = (tmp_path / "pcp" / "tensorboard").iterdir()
+    assert b"open_loop" in events.read_bytes()
+    assert b"GIF89a" in events.read_bytes()
     kept = OmegaConf.load(tmp_path / "pcp" / "config.yaml")
     assert kept.env.options.horizon == 30  # the dataset's, where the command has the default
     assert (kept.training.updates, kept.agent.behaviours.reach.reward.name) == (4, "position_distance")
@@ -78,6 +81,9 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     assert len(results["agents"]["dreamer"]["per_goal"][0]["final_score"]) == 4
     for name in ("heatmap.png", "learning_curve.png", "episodes.mp4", "episodes_image_goals.mp4"):
         assert (output / name).stat().st_size > 1000, name
+    page = (output / "report.html").read_text()
+    assert len(re.findall(r'src="data:(?:image/png|video/mp4);base64,', page)) == page.count("src=") == 7
+    assert all(f"<td>{cell}</td>" in page for row in rows for cell in (row[0].strip("| "), *row[1:-1]))
     more = (f"include=[{output}/results.json]", *small, "video_goals=0", f"output={tmp_path}/more")
     printed = run("evaluate.py", f"checkpoint={second}", *more)  # random actions are in it already
     rows = [line.split(" | ") for line in printed.splitlines()[2:7]]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import imageio.v3 as imageio
 import pytest
 import torch
 from torchrl.record.loggers import CSVLogger
 from torchrl.trainers import Trainer
 
 from torchrl_ocwm.agents import build_agent
+from torchrl_ocwm.evaluation import write_video
 from torchrl_ocwm.testing import random_records, reacher_task
 from torchrl_ocwm.training.hooks import UpdateClock
 from torchrl_ocwm.training.loggers import make_loggers
@@ -51,6 +53,24 @@ def test_tensorboard_hides_what_came_after(tmp_path: Path) -> None:
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     assert [(event.step, event.value) for event in events.Scalars("score")] == [(1, 1.0), (2, 20.0)]
+
+
+def test_tensorboard_shows_videos(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    colours = torch.tensor([[250, 0, 0], [0, 250, 0], [0, 0, 250]], dtype=torch.uint8)  # a frame each
+    write_video(tmp_path / "film.mp4", colours[:, :, None, None].expand(3, 3, 20, 30), scale=3)
+    loggers = make_loggers(tmp_path, ("tensorboard",))
+    loggers.log_video("open_loop", tmp_path / "film.mp4", step=7)
+    loggers.loggers[-1].experiment.close()
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    [event] = events.Images("open_loop")
+    assert (event.step, event.height, event.width) == (7, 20, 30)
+    frames = imageio.imread(event.encoded_image_string, extension=".gif", index=None)
+    assert frames.shape == (3, 20, 30, 3)
+    assert frames.mean((1, 2)).argmax(-1).tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize("name", ["dreamer", "focus_lcp"])

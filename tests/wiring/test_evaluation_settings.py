@@ -68,7 +68,7 @@ def evaluate(
             patch.setattr(EvaluationEnvs, "run", note_run)
             patch.setattr(episodes, "make_worker", note_worker)
             for name in ("draw", "picture_episodes"):
-                patch.setattr(module, name, lambda *_, **__: None)
+                patch.setattr(module, name, lambda *_, **__: ())
             patch.setattr(pictures, "write_video", lambda file, frames: seen["films"].append((Path(file).name, frames)))
             small = {"goals": 1, "episode_steps": 1, "workers": 0, "video_goals": 0, "random": "false"}
             named = {argument.partition("=")[0] for argument in arguments}

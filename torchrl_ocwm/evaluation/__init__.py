@@ -16,6 +16,7 @@ from torchrl_ocwm.evaluation.episodes import (
     transition,
 )
 from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
+from torchrl_ocwm.evaluation.html import write_html
 from torchrl_ocwm.evaluation.imagined import imagined_distance, imagined_rollout, predicted_return
 from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation, can_play
 from torchrl_ocwm.evaluation.objects import object_errors
@@ -67,6 +68,7 @@ __all__ = [
     "tile",
     "to_json",
     "transition",
+    "write_html",
     "write_video",
     "writing",
 ]

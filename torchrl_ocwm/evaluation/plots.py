@@ -43,18 +43,23 @@ def heatmap(path: str | Path, scores: dict[str, Tensor], workspace: Workspace, *
     save_figure(figure, path)
 
 
-def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict[str, str]) -> None:
+def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict[str, str]) -> bool:
     """Draw metrics that training logged, the mean over the runs of each agent and their range.
 
     Args:
         path: PNG file to write.
         runs: Name → folders of its runs, one per seed.
         metrics: Logged name → axis label, one panel each. What no run has logged gets no panel.
+
+    Returns:
+        Whether there was anything to draw. Without it there is no picture.
     """
     found = {metric: {name: _curves(folders, metric) for name, folders in runs.items()} for metric in metrics}
     found = {metric: curves for metric, curves in found.items() if any(curves.values())}
-    figure, axes = _panels(max(len(found), 1), columns=4, width=4.2, height=3.2)
-    for axis, (metric, agents) in zip(axes, found.items(), strict=False):
+    if not found:
+        return False
+    figure, axes = _panels(len(found), columns=4, width=4.2, height=3.2)
+    for axis, (metric, agents) in zip(axes, found.items(), strict=True):
         for color, (name, curves) in enumerate(agents.items()):
             if curves:
                 _draw_seeds(axis, curves, name, f"C{color}")
@@ -65,6 +70,7 @@ def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict
         axis.grid(alpha=0.3)
         axis.legend(fontsize="small")
     save_figure(figure, path)
+    return True
 
 
 def metric_lines(

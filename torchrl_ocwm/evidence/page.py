@@ -96,7 +96,8 @@ def _section(env: str, figure: Figure, done: Sequence[Result], root: Path, folde
             workspace = make_task(env, **data.options).workspace
             heatmap(place / "heatmap.png", report.per_goal("final_score"), workspace, title="final score")
         elif kind == "curves":
-            learning_curves(place / "curves.png", _folders(done, root), CURVE)
+            if not learning_curves(place / "curves.png", _folders(done, root), CURVE):
+                continue
         else:
             metric_lines(place / "lines.png", _lines(figure, done, report), figure.places)
         pictures.append(f"![{kind}]({env}/{kind}.png)")

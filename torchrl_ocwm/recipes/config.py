@@ -33,7 +33,7 @@ with needs("a recipe", "recipes"):
 T = TypeVar("T")
 #: All groups of options that there are.
 GROUPS = {"agent", "explore", "size", "env"}
-_PATHS = ("checkpoint", "dataset", "output")
+_PATHS = ("checkpoint", "dataset", "include", "output")
 _QUIET = ("job_logging", "hydra_logging")
 
 
@@ -120,8 +120,14 @@ def keep_settings(settings: Any, folder: Path) -> None:
 def kept(settings: Any, folder: Path) -> dict[str, Any]:
     """Settings for a file in a folder to hold: paths of what is there are as seen from that folder."""
     plain = to_dict(settings)
-    there = [name for name in _PATHS if plain.get(name) is not None and Path(plain[name]).exists()]
-    return {**plain, **{name: seen_from(folder, plain[name]) for name in there}}
+    return {**plain, **{name: _seen_from(folder, plain[name]) for name in _PATHS if plain.get(name) is not None}}
+
+
+def _seen_from(folder: Path, given: Any) -> Any:
+    """A path or several, as seen from a folder; names of what is not there stay as they are."""
+    if isinstance(given, (list, tuple)):
+        return [_seen_from(folder, one) for one in given]
+    return seen_from(folder, given) if Path(given).exists() else given
 
 
 def run_folder(output: str) -> Path:

@@ -27,6 +27,7 @@ from torchrl_ocwm.evaluation import (
     picture_objects,
     random_sequences,
     to_json,
+    write_html,
     writing,
 )
 from torchrl_ocwm.modules import ObjectWorldModel
@@ -42,7 +43,7 @@ class Diagnose(Diagnosis):
     Args:
         checkpoint: Checkpoint of the agent whose world model is examined.
         dataset: Folder of a dataset of the same task.
-        output: Folder for table, numbers, pictures and video.
+        output: Folder for table, numbers, pictures, video, and a page with all of them.
     """
 
     checkpoint: str
@@ -68,7 +69,9 @@ def main(config: Diagnose) -> None:
     with writing(output / "diagnosis.md") as file:
         file.write_text(table + "\n", encoding="utf-8")
     print(table)
-    print(f"\ntable, numbers, pictures: {output}")
+    drawn = _drawn(agent, settings, imagined=bool(errors["imagined"]), latents=bool(goals))
+    page = write_html(output, f"Diagnosis of a world model of {agent.task.name}", table, drawn, kept(config, output))
+    print(f"\ntable, numbers, pictures: {output}; all on one page: {page}")
 
 
 def _records(path: Path, checkpoint: str, task: Task, settings: Diagnosis) -> TensorDictBase:
@@ -89,6 +92,13 @@ def _errors(agent: Agent, records: TensorDictBase, settings: Diagnosis, output: 
     if isinstance(model, ObjectWorldModel) and settings.video_sequences:
         picture_objects(output, model, records[: settings.video_sequences], settings.context, names)
     return errors
+
+
+def _drawn(agent: Agent, settings: Diagnosis, *, imagined: bool, latents: bool) -> list[str]:
+    """Names of the pictures and videos of this diagnosis; earlier ones may lie in the same folder."""
+    objects = isinstance(agent.model, ObjectWorldModel) and settings.video_sequences > 0
+    names = {"errors.png": imagined, "objects.png": objects, "objects.mp4": objects, "goal_latents.png": latents}
+    return [name for name, there in names.items() if there]
 
 
 def _goals(agent: Agent, records: TensorDictBase, settings: Diagnosis, output: Path) -> dict[str, dict[str, float]]:

@@ -19,8 +19,17 @@ from torchrl_ocwm import load_agent
 from torchrl_ocwm.agents import Policy, agent_file, agent_name, describe
 from torchrl_ocwm.data import SmoothRandomPolicy
 from torchrl_ocwm.envs import Task
-from torchrl_ocwm.evaluation import Evaluation, EvaluationEnvs, Footage, Report, check_ffmpeg, goal_images, measure
-from torchrl_ocwm.recipes.config import recipe
+from torchrl_ocwm.evaluation import (
+    Evaluation,
+    EvaluationEnvs,
+    Footage,
+    Report,
+    check_ffmpeg,
+    goal_images,
+    measure,
+    write_html,
+)
+from torchrl_ocwm.recipes.config import kept, recipe
 from torchrl_ocwm.recipes.pictures import FILMS, draw, film, picture_episodes
 from torchrl_ocwm.recipes.scores import IMAGE_GOALS, goal_kinds, score
 from torchrl_ocwm.settings import SettingsError
@@ -35,7 +44,7 @@ class Evaluate(Evaluation):
         checkpoint: Checkpoint or trained agent, as ``load_agent`` takes it, or list of them: those of one agent count
             as its seeds, each agent is a row.
         include: ``results.json`` of earlier evaluations with the same goals and settings, whose rows come first.
-        output: Folder for table, numbers, heatmaps, learning curve and video.
+        output: Folder for table, numbers, heatmap, learning curve, videos, and a page with all of them.
     """
 
     checkpoint: str | tuple[str, ...]
@@ -87,14 +96,16 @@ def main(config: Evaluate) -> None:
                 report.add(name + kind, scores, **run)
     report.save(output)
     print(report.markdown())
-    draw(report, task, output)
+    drawn = [*draw(report, task, output)]
     if settings.video_goals:
         films = {kind: footage[kind].episodes() for kind in goal_kinds(policies[-1], settings.image_goals)}
         for kind, episodes in films.items():
             seen = images[chosen] if images is not None and kind == IMAGE_GOALS else None
             film(policies[-1], episodes, goals[chosen], settings.seed, output / FILMS[kind], seen)
-        picture_episodes(policies[-1].agent, next(iter(films.values())), output)
-    print(f"\ntable, numbers, heatmap, learning curve, videos: {output}")
+        drawn += [FILMS[kind] for kind in films]
+        drawn += picture_episodes(policies[-1].agent, next(iter(films.values())), output)
+    page = write_html(output, f"Evaluation on {task.name}", report.markdown(), drawn, kept(config, output))
+    print(f"\ntable, numbers, pictures, videos: {output}; all on one page: {page}")
 
 
 def _report(goals: Tensor, settings: Evaluation, include: Sequence[str], more: dict[str, Any]) -> Report:

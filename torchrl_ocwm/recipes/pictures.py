@@ -39,13 +39,14 @@ CURVES = {
 }
 
 
-def draw(report: Report, task: Task, output: Path) -> None:
-    """Scores over the workspace, and how the agents of each row learnt."""
+def draw(report: Report, task: Task, output: Path) -> list[str]:
+    """Scores over the workspace, and how the agents of each row learnt, if that was logged; names of the files."""
     heatmap(output / "heatmap.png", report.per_goal("final_score"), task.workspace, title="final score")
     runs: dict[str, list[Path]] = {}
     for name, row in report.rows.items():
         runs.setdefault(name.removesuffix(IMAGE_GOALS), _folders(row.sources))
-    learning_curves(output / "learning_curve.png", runs, CURVES)
+    learnt = learning_curves(output / "learning_curve.png", runs, CURVES)
+    return ["heatmap.png", *["learning_curve.png"] * bool(learnt)]
 
 
 def film(
@@ -67,13 +68,15 @@ def film(
     write_video(file, tile(rows))
 
 
-def picture_episodes(agent: Agent, episodes: TensorDictBase, output: Path) -> None:
-    """What an object-centric world model sees and imagines of the objects in these episodes."""
-    if isinstance(agent.model, ObjectWorldModel):
-        records = episode_records(episodes)
-        context = min(CONTEXT, records.shape[1] - 1)
-        picture_objects(output, agent.model, records, context, agent.task.objects)
-        draw_errors(output / "errors.png", object_errors(agent.model, records, context), agent.task.objects)
+def picture_episodes(agent: Agent, episodes: TensorDictBase, output: Path) -> tuple[str, ...]:
+    """What an object-centric world model sees and imagines of the objects in these episodes; names of the files."""
+    if not isinstance(agent.model, ObjectWorldModel):
+        return ()
+    records = episode_records(episodes)
+    context = min(CONTEXT, records.shape[1] - 1)
+    picture_objects(output, agent.model, records, context, agent.task.objects)
+    draw_errors(output / "errors.png", object_errors(agent.model, records, context), agent.task.objects)
+    return ("objects.png", "objects.mp4", "errors.png")
 
 
 def _folders(sources: list[str | Path]) -> list[Path]:

@@ -69,8 +69,10 @@ class Loggers:
                 logger.experiment.file_writer.add_event(restart)
 
     def log_video(self, name: str, file: Path, step: int | None = None) -> None:
-        """Show a video file in Weights & Biases; the other loggers do not take files."""
+        """Show a video file in TensorBoard, among the images, and in Weights & Biases; CSV files take none."""
         for logger in self.loggers:
+            if type(logger).__name__ == "TensorboardLogger":
+                _show_in_tensorboard(logger, name, file, step)
             if type(logger).__name__ == "WandbLogger":
                 import wandb
 
@@ -106,6 +108,19 @@ def make_loggers(folder: Path, also: tuple[str, ...] = (), *, name: str = "run")
 
             loggers.append(WandbLogger(name, save_dir=str(folder), project="torchrl_ocwm"))
     return Loggers(loggers)
+
+
+def _show_in_tensorboard(logger: Logger, name: str, file: Path, step: int | None) -> None:
+    """As an animated GIF. TensorBoard's own ``add_video`` makes one too, but needs moviepy for it."""
+    import imageio.v3 as imageio
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    frames = imageio.imread(file, plugin="FFMPEG")[:, 1::3, 1::3]  # films are enlarged three times
+    gif = imageio.imwrite("<bytes>", frames, extension=".gif", plugin="pillow", loop=0, duration=67)
+    height, width = frames.shape[1:3]
+    image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)
+    logger.experiment.file_writer.add_summary(Summary(value=[Summary.Value(tag=name, image=image)]), step)
+    logger.experiment.flush()
 
 
 def _cut(file: Path, step: int) -> None:
