@@ -39,7 +39,8 @@ test: check
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 test-next: $(NEXT)/.installed
-	$(NEXT)/bin/python -m pytest -q tests/modules tests/objectives torchrl_ocwm/modules torchrl_ocwm/objectives
+	$(NEXT)/bin/python -m pytest -q -n 2 --dist loadfile -m "not slow" tests/modules tests/objectives \
+		torchrl_ocwm/modules torchrl_ocwm/objectives
 
 # The documentation site, in site/index.html; `make docs SERVE=1` shows it at http://127.0.0.1:8000 while you write.
 docs: $(INSTALLED)
