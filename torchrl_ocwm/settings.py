@@ -162,7 +162,7 @@ def to_dict(settings: Any) -> Any:
     Examples:
         >>> from torchrl_ocwm.agents import AGENTS
         >>> to_dict(AGENTS["dreamer_pcp"])["behaviours"]["reach"]["reward"]
-        {'name': 'position_distance'}
+        {'name': 'position_distance', 'unit': 'metre'}
     """
     if isinstance(settings, Mapping):
         return {name: to_dict(value) for name, value in settings.items()}

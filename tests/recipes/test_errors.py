@@ -14,6 +14,7 @@ from torchrl_ocwm.data import CollectionError, SourceError
 from torchrl_ocwm.data.dataset import DatasetError
 from torchrl_ocwm.devices import DeviceError
 from torchrl_ocwm.envs import registry
+from torchrl_ocwm.envs.calibration import CalibrationError
 from torchrl_ocwm.envs.missing import SystemLibraryError
 from torchrl_ocwm.envs.opengl import RenderingError
 from torchrl_ocwm.envs.positioning import NoScriptedPolicyError, SimulationDivergedError
@@ -32,6 +33,7 @@ from torchrl_ocwm.training.loggers import LogError
 from torchrl_ocwm.training.offline import EvaluationError
 
 KINDS = {
+    CalibrationError: ValueError,
     SourceError: ValueError,
     CollectionError: RuntimeError,
     DatasetError: ValueError,

@@ -151,7 +151,7 @@ def test_a_behaviour_is_evaluated(
         return policy
 
     monkeypatch.setattr(scripts["evaluate"], "load_agent", note)
-    monkeypatch.setattr(scripts["evaluate"], "draw", lambda *_, **__: None)
+    monkeypatch.setattr(scripts["evaluate"], "draw", lambda *_, **__: [])
     small = (f"checkpoint={checkpoint}", "goals=1", "episode_steps=1", "workers=0", "video_goals=0", "random=false")
     assert "| dreamer_pcp + apt, explore |" in command(
         "evaluate", f"checkpoint={checkpoint}", "behaviour=explore", *small

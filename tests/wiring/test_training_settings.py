@@ -349,7 +349,8 @@ def test_the_recipe_trains_what_it_is_told(
 
 @shows("TrainOffline.env")
 def test_the_dataset_is_of_that_environment(train: Callable[..., str], tmp_path: Path) -> None:
-    assert train("env=cube_move", "output=run") == f"DatasetError: {tmp_path}/data: holds reacher, not env=cube_move"
+    said = f"DatasetError: {tmp_path}/data: holds reacher, not env=cube_move; give env.name=reacher"
+    assert train("env=cube_move", "output=run") == said
     kept = to_dict(EpisodeDataset.open(tmp_path / "data").metadata["options"])
     train("env.options.horizon=3", "output=run")
     assert f"options: {kept}" in (tmp_path / "run" / "config.yaml").read_text()  # what the dataset was made with

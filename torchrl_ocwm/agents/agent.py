@@ -50,7 +50,9 @@ class Policy(TensorDictSequential):
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Act; takes the arguments of :class:`~tensordict.nn.TensorDictSequential`."""
         weight = next(self.behaviour.actor.parameters())
-        with torch.autocast(weight.device.type, weight.dtype, enabled=weight.dtype in (torch.bfloat16, torch.float16)):
+        if weight.dtype not in (torch.bfloat16, torch.float16):
+            return super().forward(*args, **kwargs)
+        with torch.autocast(weight.device.type, weight.dtype):
             return super().forward(*args, **kwargs)
 
     @property

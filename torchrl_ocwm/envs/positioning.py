@@ -15,7 +15,7 @@ from torchrl_ocwm.envs.camera import Camera, Frame
 from torchrl_ocwm.envs.colour_masks import ColourMasks
 from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.positions import masks_to_positions
-from torchrl_ocwm.envs.screen import MODES, Screen
+from torchrl_ocwm.envs.screen import Screen
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.envs.workspace import Workspace
 from torchrl_ocwm.errors import UserError
@@ -67,8 +67,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
             (:class:`~torchrl_ocwm.envs.ColourMasks`), as with a real camera; 0 for the simulator's masks at every step.
         camera_options: Passed to :class:`~torchrl_ocwm.envs.Camera`: shadows, reflections, multisampling, max_geoms.
         privileged: Add ``object_position_true`` to the observations.
-        render_mode: ``"rgb_array"`` makes :meth:`render` return the camera's picture (H, W, 3); ``"human"`` opens
-            MuJoCo's viewer, which follows each step.
+        render_mode: ``"rgb_array"`` makes :meth:`render` return the camera's picture (H, W, 3).
         render_size: Pixels on a side of that picture; ``None``: the image that the agent sees.
 
     Attributes:
@@ -82,7 +81,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         RuntimeError: if the environment is closed.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [*MODES], "render_fps": 25}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
 
     workspace: ClassVar[Workspace]
     #: World position that all positions are relative to, metres.
@@ -128,7 +127,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
                 raise ValueError(f"{name} must be 0 or more, got {value}")
         self.image_size, self.horizon, self.action_repeat = image_size, horizon, action_repeat
         self.mask_scale, self.virtual_target, self.render_mode = mask_scale, virtual_target, render_mode
-        self.privileged, self._screen = privileged, Screen(render_mode, render_size)
+        self.privileged, self._screen = privileged, Screen(render_size)
         self.model, self.data = self._load()
         size: dict[str, Any] = {"height": image_size, "width": image_size, "mask_scale": mask_scale}
         self.camera = Camera(self.model, self.camera_name, **size, **(camera_options or {}))
@@ -236,7 +235,6 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         self._last_seen = np.zeros_like(self._last_seen)
         observation = self._observe(self.data)
         self._last_seen = observation["object_position"]
-        self._screen.follow(self)
         return observation, {"success": self._distance(observation) <= SUCCESS_DISTANCE}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict]:
@@ -252,14 +250,13 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         self._steps += 1
         observation = self._observe(self.data)
         self._last_seen = observation["object_position"]
-        self._screen.follow(self)
         distance = self._distance(observation)
         success = {"success": distance <= SUCCESS_DISTANCE}
         return observation, -distance, False, self._steps >= self.horizon, success  # Eq. 1
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """The camera's picture (H, W, 3) uint8, with ``render_mode="rgb_array"``."""
-        if self.render_mode is None:
+        if self.render_mode != "rgb_array":
             return None
         self._check_open()
         return self._screen.picture(self)

@@ -93,7 +93,7 @@ class Page:
     def _lay_out(self) -> None:
         with gr.Row():
             with gr.Column(scale=2, min_width=300):
-                script = (_HERE / "page.js").read_text()
+                script = (_HERE / "page.js").read_text(encoding="utf-8")
                 self.camera = gr.HTML(js_on_load=script, elem_id="camera", apply_default_css=False)
                 self.numbers = gr.HTML(elem_id="numbers", apply_default_css=False)
             with gr.Column(scale=1, min_width=120):
