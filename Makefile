@@ -10,11 +10,21 @@ STEPS ?= 50000
 WORKERS := 2
 # The series of TorchRL after that of constraints.txt, as far as the package registry has it: the quick tests run with it.
 NEXT := .venv-next
+LONG := \
+	tests/training/test_stepper.py::test_update_compiles_into_one_graph[dreamer-changes0] \
+	tests/training/test_stepper.py::test_update_compiles_into_one_graph[dreamer_pcp-changes1] \
+	tests/envs/test_scripted.py::test_script_reaches_the_landmarks[cube_move-60] \
+	tests/examples/test_every_environment.py::test_from_dataset_to_film[pick_place-focus_lcp] \
+	tests/examples/test_stopping.py::test_ends_with_its_children[collect.py-9-False] \
+	tests/evaluation/test_episodes.py::test_process_that_dies_or_hangs_ends_the_evaluation[19] \
+	tests/data/test_collect.py::test_process_that_dies_or_hangs_is_replaced[19] \
+	tests/training/test_online.py::test_the_recipe_goes_on_after_a_signal[Ctrl-C] \
+	tests/examples/test_benchmarks.py::test_speed_of_an_evaluation_adds_up
 NEXT_VERSIONS := torchrl-nightly==2026.10.27 tensordict==0.15.3
 
 export MUJOCO_GL ?= egl
 
-.PHONY: demo test test-next docs check clean
+.PHONY: demo test test-next test-long docs check clean
 .DELETE_ON_ERROR:
 
 demo: check $(DEMO)/evaluation/.done
@@ -34,9 +44,13 @@ test: check
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/mypy --platform win32
 	$(MAKE) test-next
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(LONG:%=--deselect '%')
+
+# What `make test` leaves out so that it stays below 20 minutes: others like them are in it.
+test-long: check
+	$(BIN)/mypy --platform win32
+	$(BIN)/python -m pytest -q $(LONG:%='%')
 
 test-next: $(NEXT)/.installed
 	$(NEXT)/bin/python -m pytest -q -n 2 --dist loadfile -m "not slow" tests/modules tests/objectives \
