@@ -125,6 +125,7 @@ def test_click_a_goal_and_see_the_distance_fall(stage: Stage, visit: Callable[..
         one.tab.mouse.click(*one.at(0.15, -0.05))  # the other side of the arm
         one.until(f"{DISTANCE} > 15")
         one.until_there()
+        assert one.tab.evaluate(DISTANCE) < 5
 
 
 def is_shipped() -> bool:
@@ -142,6 +143,7 @@ def test_the_shipped_agent_comes_within_five_centimetres(visit: Callable[..., An
             one.tab.mouse.click(*one.at(*goal))
             one.until_goal(*goal)
             one.until_there()
+            assert one.tab.evaluate(DISTANCE) < 5
 
 
 def test_drag_the_object(stage: Stage, visit: Callable[..., Any]) -> None:
@@ -191,7 +193,9 @@ def test_a_click_outside_is_explained(stage: Stage, visit: Callable[..., Any]) -
     with visit(stage) as one:
         box = one.tab.locator("#camera img").bounding_box()
         one.tab.mouse.click(box["x"] + 4, box["y"] + 4)
-        one.tab.get_by_text("outside the workspace").wait_for(timeout=PATIENCE)
+        said = one.tab.get_by_text("outside the workspace")
+        said.wait_for(timeout=PATIENCE)
+        assert said.is_visible()
 
 
 def test_choose_an_agent_and_pick_a_goal_image(make_agent: Callable[..., Agent], visit: Callable[..., Any]) -> None:

@@ -21,6 +21,7 @@ from torchrl_ocwm.data import EpisodeDataset
 from torchrl_ocwm.devices import DeviceError
 from torchrl_ocwm.envs import Workspace
 from torchrl_ocwm.evaluation import landmarks
+from torchrl_ocwm.recipes import landmarks as evaluations
 from torchrl_ocwm.settings import change, to_dict
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
 from torchrl_ocwm.training import run as runs
@@ -311,7 +312,7 @@ def test_evaluations_beside_training(
         seen.append(settings["beside"])
         return nullcontext()
 
-    monkeypatch.setattr(scripts[script], "LandmarkEvaluation", note)
+    monkeypatch.setattr(evaluations, "LandmarkEvaluation", note)
     monkeypatch.setattr(scripts[script], script, lambda *_, **__: Path("run", "checkpoint.zip"))
     if script == "train_online":
         monkeypatch.setattr(scripts[script], "collect_seed_steps", lambda *_, **__: dataset)

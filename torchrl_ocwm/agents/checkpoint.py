@@ -76,7 +76,7 @@ def load_agent(path: str | Path, *, behaviour: str | None = None, device: torch.
     """
     path, device = agent_file(path), usable_device(device)
     agent = rebuild(read_description(path))
-    lasting = "weights" in read_manifest(path)["components"]
+    lasting = "weights" in Archive.manifest(path)["components"]  # which was checked with the description
     kept: dict[str, Any] = {"weights": AgentWeights(agent)} if lasting else {"loss_module": agent.loss}
     Archive(**kept).load(path, map_location="cpu")
     agent.to(device).eval().requires_grad_(False)

@@ -69,9 +69,10 @@ class RelabelGoals(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write goals and rewards into a batch ``[B, T]``; nothing without positions."""
-        if ("next", "object_position") not in tensordict.keys(True):
+        positions = tensordict.get(("next", "object_position"), None)
+        if positions is None:
             return tensordict
-        position = tensordict["next", "object_position"][..., self.object_index, :]
+        position = positions[..., self.object_index, :]
         if self._draws:
             goal = self.workspace.sample(position.shape[:-2]).to(position).unsqueeze(-2).expand_as(position)
             tensordict["next", "goal_position"] = goal.contiguous()

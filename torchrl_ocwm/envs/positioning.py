@@ -15,7 +15,6 @@ from torchrl_ocwm.envs.camera import Camera, Frame
 from torchrl_ocwm.envs.colour_masks import ColourMasks
 from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.positions import masks_to_positions
-from torchrl_ocwm.envs.screen import Screen
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.envs.workspace import Workspace
 from torchrl_ocwm.errors import UserError
@@ -97,6 +96,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
     depth_offset: ClassVar[float] = 0.0
     blind: bool = False
     _colour_masks: ColourMasks | None = None
+    _large_camera: Camera | None
     _made_with: partial[PositioningEnv]
 
     def __init__(
@@ -118,6 +118,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
             "horizon": horizon,
             "action_repeat": action_repeat,
             "mask_scale": mask_scale,
+            **({} if render_size is None else {"render_size": render_size}),
         }
         for name, value in counts.items():
             if value < 1:
@@ -127,7 +128,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
                 raise ValueError(f"{name} must be 0 or more, got {value}")
         self.image_size, self.horizon, self.action_repeat = image_size, horizon, action_repeat
         self.mask_scale, self.virtual_target, self.render_mode = mask_scale, virtual_target, render_mode
-        self.privileged, self._screen = privileged, Screen(render_size)
+        self.privileged, self.render_size, self._large_camera = privileged, render_size, None
         self.model, self.data = self._load()
         size: dict[str, Any] = {"height": image_size, "width": image_size, "mask_scale": mask_scale}
         self.camera = Camera(self.model, self.camera_name, **size, **(camera_options or {}))
@@ -259,15 +260,21 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         if self.render_mode != "rgb_array":
             return None
         self._check_open()
-        return self._screen.picture(self)
+        if self.render_size is None:
+            return np.ascontiguousarray(self._observe(self.data)["pixels"].transpose(1, 2, 0))
+        if self._large_camera is None:
+            size: dict[str, Any] = {"height": self.render_size, "width": self.render_size, "multisampling": 4}
+            self._large_camera = Camera(self.model, self.camera_name, **size)
+        return self._large_camera.picture(self.data)
 
     def close(self) -> None:
         """Free the simulator and the OpenGL context. Closing twice does nothing."""
         if "camera" in self.__dict__:
             self.camera.close()
-            self._screen.close()
+            if self._large_camera is not None:
+                self._large_camera.close()
         # Wrappers of gymnasium and TorchRL refer to each other, so that this object may stay for long.
-        for name in ("camera", "model", "data", "_scratch"):
+        for name in ("camera", "_large_camera", "model", "data", "_scratch"):
             self.__dict__.pop(name, None)
         self._close_simulator()
 

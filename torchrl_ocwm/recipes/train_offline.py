@@ -7,7 +7,6 @@ Can be stopped (Ctrl-C, SIGTERM) and run again: it goes on where it was, to the 
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -17,10 +16,11 @@ from torchrl_ocwm.agents import AgentConfig, Size, build_agent
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs import RecordedEnv
-from torchrl_ocwm.evaluation import LandmarkEvaluation, OpenLoopFilm, can_play
+from torchrl_ocwm.evaluation import OpenLoopFilm
 from torchrl_ocwm.recipes.config import keep_settings, recipe, run_folder
+from torchrl_ocwm.recipes.landmarks import landmark_evaluation
 from torchrl_ocwm.settings import Settings
-from torchrl_ocwm.training import Training, check_memory, evaluates_beside, train_offline
+from torchrl_ocwm.training import Training, check_memory, train_offline
 
 
 @dataclass(frozen=True)
@@ -61,19 +61,8 @@ def main(config: TrainOffline) -> None:
     torch.manual_seed(training.seed)
     agent = build_agent(config.agent, task, config.size)
     # Made only if they are used: each checks whether it can do its work before any is done.
-    evaluation = film = None
-    with ExitStack() as stack:
-        if training.eval_interval and can_play(task):
-            evaluation = stack.enter_context(
-                LandmarkEvaluation(
-                    agent,
-                    episodes=training.eval_episodes,
-                    episode_steps=training.eval_steps,
-                    beside=evaluates_beside(training, config.size),
-                )
-            )
-        if training.video_interval:
-            film = OpenLoopFilm(agent, dataset, folder / "videos")
+    with landmark_evaluation(agent, training) as evaluation:
+        film = OpenLoopFilm(agent, dataset, folder / "videos") if training.video_interval else None
         keep = partial(keep_settings, config, folder)
         checkpoint = train_offline(agent, dataset, folder, training, evaluate=evaluation, film=film, on_start=keep)
     print(f"checkpoint: {checkpoint}")

@@ -18,11 +18,12 @@ from torchrl_ocwm.agents import AgentConfig, Size, build_agent
 from torchrl_ocwm.data import with_coverage
 from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs import EnvChoice, make_task
-from torchrl_ocwm.evaluation import LandmarkEvaluation, OpenLoopFilm, check_ffmpeg
+from torchrl_ocwm.evaluation import OpenLoopFilm, check_ffmpeg
 from torchrl_ocwm.recipes.config import keep_settings, recipe, run_folder
+from torchrl_ocwm.recipes.landmarks import landmark_evaluation
 from torchrl_ocwm.settings import Settings
 from torchrl_ocwm.signals import ended_by_signals
-from torchrl_ocwm.training import Online, Training, check_memory, collect_seed_steps, evaluates_beside, train_online
+from torchrl_ocwm.training import Online, Training, check_memory, collect_seed_steps, train_online
 
 
 @dataclass(frozen=True)
@@ -59,26 +60,16 @@ def main(config: TrainOnline) -> None:
     check_memory(config.agent, task, config.size, usable_device(training.device))
     torch.manual_seed(training.seed)
     agent = build_agent(config.agent, task, config.size)
-    evaluation = film = None
     with ExitStack() as stack:
         # Each checks whether it can do its work before any is done.
-        if training.eval_interval:
-            evaluation = stack.enter_context(
-                LandmarkEvaluation(
-                    agent,
-                    episodes=training.eval_episodes,
-                    episode_steps=training.eval_steps,
-                    beside=evaluates_beside(training, config.size),
-                )
-            )
+        evaluation = stack.enter_context(landmark_evaluation(agent, training))
         if training.video_interval:
             check_ffmpeg("training.video_interval")
         path = Path(config.dataset or folder / "data")
         with ended_by_signals():
             dataset = collect_seed_steps(path, name, config.online, seed=training.seed, options=options)
         stack.enter_context(dataset)
-        if training.video_interval:
-            film = OpenLoopFilm(agent, dataset, folder / "videos")
+        film = OpenLoopFilm(agent, dataset, folder / "videos") if training.video_interval else None
         keep = partial(keep_settings, config, folder)
         checkpoint = train_online(
             agent, dataset, folder, training, config.online, evaluate=evaluation, film=film, on_start=keep
