@@ -375,6 +375,20 @@ class TestSignals:
         file = train(fresh(), dataset, tmp_path, evaluate=endless)
         assert updates_in(file) == 2
 
+    def test_a_signal_that_comes_back_as_another_error(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
+        """As ctypes does while an image is drawn."""
+
+        def draw(updates: int) -> dict[str, float]:
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(5)
+            except BaseException as error:
+                raise OSError("argument 2") from error
+            return {}
+
+        file = train(fresh(), dataset, tmp_path, evaluate=draw)
+        assert updates_in(file) == 2
+
     def test_handlers_are_given_back(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
         train(fresh(), dataset, tmp_path, replace(SHORT, updates=2))

@@ -181,6 +181,10 @@ class StopOnSignals:
             return result
         except _Stopped:
             return None
+        except Exception:  # ctypes and others make an error of their own of what interrupts them
+            if self.stopped:
+                return None
+            raise
         finally:
             self._looking = False
 
