@@ -20,11 +20,13 @@ LONG := \
 	tests/data/test_collect.py::test_process_that_dies_or_hangs_is_replaced[19] \
 	tests/training/test_online.py::test_the_recipe_goes_on_after_a_signal[Ctrl-C] \
 	tests/examples/test_benchmarks.py::test_speed_of_an_evaluation_adds_up
+# Other Pythons, of which the machine may have some (`python3.10`, or in pyenv): the package and its recipes, no simulator.
+PYTHONS := 3.10 3.13
 NEXT_VERSIONS := torchrl-nightly==2026.10.27 tensordict==0.15.3
 
 export MUJOCO_GL ?= egl
 
-.PHONY: demo test test-next test-long docs check clean
+.PHONY: demo test test-next test-pythons test-long docs check clean FORCE
 .DELETE_ON_ERROR:
 
 demo: check $(DEMO)/evaluation/.done
@@ -45,6 +47,7 @@ test: check
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(MAKE) test-next
+	$(MAKE) test-pythons
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(LONG:%=--deselect '%')
 
 # What `make test` leaves out so that it stays below 20 minutes: others like them are in it.
@@ -56,6 +59,26 @@ test-next: $(NEXT)/.installed
 	$(NEXT)/bin/python -m pytest -q -n 2 --dist loadfile -m "not slow" tests/modules tests/objectives \
 		torchrl_ocwm/modules torchrl_ocwm/objectives
 
+test-pythons: $(PYTHONS:%=test-python-%)
+
+test-python-%:
+	@for python in python$* $$HOME/.pyenv/versions/$*.*/bin/python; do \
+		$$python -c '' 2> /dev/null && exec $(MAKE) FOUND=$$python .venv-$*/.tested; \
+	done; echo "Python $* is not on this machine: not tested with it"
+
+.venv-%/.installed: pyproject.toml constraints.txt
+	$(FOUND) -m venv --clear $(@D)
+	$(@D)/bin/pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e ".[recipes]" pytest
+	@touch $@
+
+.venv-%/.tested: .venv-%/.installed FORCE
+	$(@D)/bin/python -m pytest -q torchrl_ocwm/modules torchrl_ocwm/objectives tests/training/test_own_recordings.py \
+		-k 'not test_recordings_train or simulator'
+
+.SECONDARY:
+
+FORCE:
+
 # The documentation site, in site/index.html; `make docs SERVE=1` shows it at http://127.0.0.1:8000 while you write.
 docs: $(INSTALLED)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs $(if $(SERVE),serve,build) --strict
@@ -64,7 +87,7 @@ check: $(INSTALLED)
 	@$(BIN)/python -m torchrl_ocwm.check
 
 clean:
-	rm -rf $(VENV) $(NEXT) $(DEMO)
+	rm -rf $(VENV) $(NEXT) $(PYTHONS:%=.venv-%) $(DEMO)
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@version=$$($(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])'); \

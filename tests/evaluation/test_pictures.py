@@ -11,10 +11,10 @@ import pytest
 import torch
 from torchrl.record.loggers import CSVLogger
 
-from torchrl_ocwm.evaluation import Report
+from torchrl_ocwm.evaluation import Report, plots
 from torchrl_ocwm.evaluation.imagined import imagined_rollout
 from torchrl_ocwm.evaluation.output import OutputError
-from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, read_scalar
+from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, metric_lines, read_scalar
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm, decode_video, mark, open_loop_prediction, tile, write_video
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
 
@@ -57,6 +57,18 @@ def test_learning_curves(tmp_path: Path) -> None:
     np.testing.assert_array_equal(imageio.imread(tmp_path / "more.png"), image)  # no panel for what nobody logged
     assert not learning_curves(tmp_path / "none.png", {"agent": [tmp_path / "none"]}, {"evaluation/score": "score"})
     assert not (tmp_path / "none.png").exists()
+
+
+def test_the_legend_names_each_line_once_beside_the_panels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr(plots, "save_figure", lambda figure, path: drawn.append(figure))
+    point = {"1": (0.5, None), "2": (0.6, 0.1)}
+    metric_lines(tmp_path / "lines.png", {"score": {"a": point, "b": point}, "error": {"b": point}}, "weight")
+    (legend,) = drawn[0].legends
+    assert sorted(text.get_text() for text in legend.get_texts()) == ["a", "b"]
+    drawn[0].canvas.draw()
+    box = legend.get_window_extent()
+    assert not any(box.overlaps(axis.get_window_extent()) for axis in drawn[0].axes)
 
 
 def test_video_is_readable(tmp_path: Path) -> None:

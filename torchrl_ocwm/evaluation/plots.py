@@ -68,7 +68,7 @@ def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict
         axis.set_xlabel("updates")
         axis.set_ylabel(metrics[metric])
         axis.grid(alpha=0.3)
-        axis.legend(fontsize="small")
+    _explain(figure, axes)
     save_figure(figure, path)
     return True
 
@@ -92,7 +92,7 @@ def metric_lines(
         axis.set_xlabel(places)
         axis.set_ylabel(metric)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize="small")
+    _explain(figure, axes)
     save_figure(figure, path)
 
 
@@ -119,6 +119,13 @@ def _panels(number: int, columns: int, width: float, height: float) -> tuple[Fig
     for axis in axes.flat[number:]:
         axis.remove()
     return figure, list(axes.flat[:number])
+
+
+def _explain(figure: Figure, axes: list[Axes]) -> None:
+    """One legend for all panels, above them, where it hides nothing."""
+    found = {name: line for axis in axes for line, name in zip(*axis.get_legend_handles_labels(), strict=True)}
+    columns = min(len(found), 2 * len(axes))
+    figure.legend(found.values(), found.keys(), loc="outside upper center", ncols=columns, fontsize="small")
 
 
 def _draw_seeds(axis: Axes, curves: list[tuple[np.ndarray, np.ndarray]], name: str, color: str) -> None:
