@@ -26,7 +26,7 @@ NEXT_VERSIONS := torchrl-nightly==2026.10.27 tensordict==0.15.3
 
 export MUJOCO_GL ?= egl
 
-.PHONY: demo test test-next test-pythons test-long docs check clean FORCE
+.PHONY: demo test lint test-next test-pythons test-long docs check clean FORCE
 .DELETE_ON_ERROR:
 
 demo: check $(DEMO)/evaluation/.done
@@ -43,12 +43,13 @@ demo: check $(DEMO)/evaluation/.done
 	@echo "  focus_lcp/videos/                     open-loop predictions: truth, model, error"
 
 test: check
+	$(MAKE) --jobs 2 --output-sync lint test-next test-pythons
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(LONG:%=--deselect '%')
+
+lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(MAKE) test-next
-	$(MAKE) test-pythons
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(LONG:%=--deselect '%')
 
 # What `make test` leaves out so that it stays below 20 minutes: others like them are in it.
 test-long: check
@@ -56,10 +57,12 @@ test-long: check
 	$(BIN)/python -m pytest -q $(LONG:%='%')
 
 test-next: $(NEXT)/.installed
-	$(NEXT)/bin/python -m pytest -q -n 2 --dist loadfile -m "not slow" tests/modules tests/objectives \
+	$(NEXT)/bin/python -m pytest -q -m "not slow" tests/modules tests/objectives \
 		torchrl_ocwm/modules torchrl_ocwm/objectives
 
-test-pythons: $(PYTHONS:%=test-python-%)
+# One after the other: both write the package's metadata.
+test-pythons:
+	@$(MAKE) --jobs 1 $(PYTHONS:%=test-python-%)
 
 test-python-%:
 	@for python in python$* $$HOME/.pyenv/versions/$*.*/bin/python; do \

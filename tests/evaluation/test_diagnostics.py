@@ -180,6 +180,7 @@ class TestGoalLatents:
         expected = {
             "cosine": cosine(0, 40, 65),
             "cosine_with_others": cosine(60, 90, 20, 70, 25, 35),
+            "contrast": cosine(0, 40, 65) - cosine(60, 90, 20, 70, 25, 35),
             "median_rank": 2,
             "mean_rank": 2,
             "ranked_first": 1 / 3,

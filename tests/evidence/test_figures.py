@@ -40,7 +40,7 @@ def test_there_is_a_figure_for_each_name() -> None:
         ("target_size", 6, 6),
         ("loss_scale", 1, 4),
         ("visual_goals", 1, 3),
-        ("fairness", 1, 6),
+        ("fairness", 1, 8),
         ("curves", 1, 7),
         ("exploration", 4, 4),
     ],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_ocwm.modules import StreamingNorm
+from torchrl_ocwm.modules import MovingCentre, StreamingNorm
 
 BATCHES = [torch.randn(7, 5, generator=torch.Generator().manual_seed(i)) * (i + 1) + 3 * i for i in range(6)]
 
@@ -76,3 +76,39 @@ def test_compiled_it_is_the_same() -> None:
     for batch in BATCHES[:3]:
         torch.testing.assert_close(compiled(batch), plain(batch))
     torch.testing.assert_close(other.state_dict(), plain.state_dict())
+
+
+class TestMovingCentre:
+    FIRST = torch.tensor([[1.0, 0.0], [3.0, 2.0]])
+    SECOND = torch.tensor([[[6.0, 1.0]], [[8.0, 9.0]]])
+
+    def test_the_mean_of_all_that_was_seen_and_then_a_moving_one(self) -> None:
+        centre = MovingCentre(2, rate=0.4)
+        centre(self.FIRST)
+        torch.testing.assert_close(centre.mean, torch.tensor([2.0, 1.0]))
+        torch.testing.assert_close(centre(self.SECOND), self.SECOND - torch.tensor([4.5, 3.0]))  # half of both
+        centre(self.FIRST)
+        torch.testing.assert_close(centre.mean, torch.tensor([0.6 * 4.5 + 0.4 * 2, 0.6 * 3 + 0.4 * 1]))
+
+    def test_in_evaluation_mode_it_stays(self) -> None:
+        centre = MovingCentre(2)
+        centre(self.FIRST)
+        torch.testing.assert_close(centre.eval()(self.SECOND), self.SECOND - torch.tensor([2.0, 1.0]))
+
+    def test_saved_with_its_state(self) -> None:
+        centre, again = MovingCentre(2), MovingCentre(2)
+        centre(self.FIRST)
+        again.load_state_dict(centre.state_dict())
+        torch.testing.assert_close(again(self.SECOND), centre(self.SECOND))
+
+    def test_gradients_go_through_vectors_alone(self) -> None:
+        vectors = self.FIRST.clone().requires_grad_()
+        MovingCentre(2)(vectors).sum().backward()
+        torch.testing.assert_close(vectors.grad, torch.ones(2, 2))
+
+    def test_compiled_it_is_the_same(self) -> None:
+        plain, other = MovingCentre(2), MovingCentre(2)
+        compiled = torch.compile(other, backend="eager", fullgraph=True)
+        for batch in (self.FIRST, self.SECOND):
+            torch.testing.assert_close(compiled(batch), plain(batch))
+        torch.testing.assert_close(other.state_dict(), plain.state_dict())

@@ -12,6 +12,7 @@ from torchrl_ocwm.agents import SIZES
 from torchrl_ocwm.modules import (
     LatentPositionalEncoder,
     LatentSimilarityReward,
+    MovingCentre,
     ObjectDecoder,
     ObjectLatentExtractor,
 )
@@ -102,6 +103,20 @@ class TestLatentSimilarityReward:
     def test_chord_by_hand(self, index: int, expected: float) -> None:
         reward = LatentSimilarityReward(object_index=index, distance="chord")(self.data.clone())["reward"]
         torch.testing.assert_close(reward, torch.tensor([[expected]]))
+
+    def test_centred_chord_by_hand(self) -> None:
+        """Directions (0.6, 0.8) and (0, 1) minus their mean (0.6, 0.6): (0, 0.2) and (-0.6, 0.4)."""
+        centre = MovingCentre(2).eval()
+        centre.mean.fill_(0.6)
+        reward = LatentSimilarityReward(distance="chord", centre=centre)(self.data.clone())["reward"]
+        torch.testing.assert_close(reward, -torch.tensor([[math.sqrt(2 - 2 * 0.4 / math.sqrt(0.52))]]))
+        centre.mean.zero_()
+        again = LatentSimilarityReward(distance="chord", centre=centre)(self.data.clone())["reward"]
+        torch.testing.assert_close(again, torch.tensor([[-math.sqrt(0.4)]]))
+
+    def test_a_centre_where_lengths_count(self) -> None:
+        with pytest.raises(ValueError, match="only chords take a centre, not distance='mse'"):
+            LatentSimilarityReward(distance="mse", centre=MovingCentre(2))
 
     def test_unknown_distance(self) -> None:
         with pytest.raises(ValueError, match="distance must be one of 'cosine', 'mse', 'chord', got 'euclid'"):

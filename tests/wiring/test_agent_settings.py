@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl_ocwm.agents import AGENTS, Adam, Agent, DreamerV3, build_agent
 from torchrl_ocwm.agents.checkpoint import CheckpointError, describe, rebuild
 from torchrl_ocwm.envs import Workspace
+from torchrl_ocwm.modules import MovingCentre
 from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.testing import STYLES, random_records, reacher_task
 
@@ -283,6 +284,27 @@ def test_the_distance_of_latents() -> None:
     extracted = agent.model.extractor(latent["state"], latent["belief"])[:, 0]
     expected = -(extracted - latent["goal"]).square().mean(-1, keepdim=True)
     torch.testing.assert_close(reward(agent, latent), expected)
+
+
+@shows("LatentChord.centred")
+def test_a_centred_chord_takes_out_what_imagined_latents_share() -> None:
+    """It learns the centre while it is trained, keeps it afterwards, and compares what is left."""
+    agent = make("focus_lcp", {f"{REACH}.reward.centred": True})
+    latent = latents(agent)
+    plain = reward(make("focus_lcp"), latent)
+    (centre,) = (module for module in agent.modules() if isinstance(module, MovingCentre))
+    losses(agent)
+    agent.eval()
+    mean = centre.mean.clone()
+    assert mean.norm() > 0.1
+    directions = [
+        torch.nn.functional.normalize(part, dim=-1) - mean
+        for part in (agent.model.extractor(latent["state"], latent["belief"])[:, 0], latent["goal"])
+    ]
+    cosine = torch.cosine_similarity(*directions, dim=-1).unsqueeze(-1)
+    torch.testing.assert_close(reward(agent, latent), -(2 - 2 * cosine).sqrt())
+    assert torch.equal(centre.mean, mean)
+    assert not torch.allclose(reward(agent, latent), plain)
 
 
 def starts(agent: Agent) -> tuple[Tensor, TensorDictBase]:

@@ -15,6 +15,7 @@ from torchrl_ocwm.agents.scene import Scene
 from torchrl_ocwm.modules import (
     FullLatentReward,
     LatentSimilarityReward,
+    MovingCentre,
     PositionDistanceReward,
     TemporalDistanceReward,
 )
@@ -113,11 +114,19 @@ class LatentSimilarity(Reward):
 @register("latent_chord")
 @dataclass(frozen=True)
 class LatentChord(Reward):
-    """Minus the distance between the directions of the two latents, which keeps its slope up to the goal."""
+    """Minus the distance between the directions of the two latents, which keeps its slope up to the goal.
+
+    Args:
+        centred: Whether what the directions of imagined latents have in common is taken from both first. Latents that
+            are alike wherever the object is then differ as much as others.
+    """
+
+    centred: bool = False
 
     def build(self, scene: Scene, goal: GoalEncoding | None) -> ImaginedReward:
         """The chord, from the extracted latents."""
-        return _on_object_latent(scene, "chord")
+        centre = MovingCentre(scene.architecture.object_features) if self.centred else None
+        return _on_object_latent(scene, "chord", centre)
 
 
 @register("full_latent_cosine")
@@ -168,7 +177,10 @@ class TemporalDistance(Reward):
         return ImaginedReward(TensorDictSequential(predict, TemporalDistanceReward(network)), loss, self.lr)
 
 
-def _on_object_latent(scene: Scene, distance: Literal["cosine", "mse", "chord"]) -> ImaginedReward:
+def _on_object_latent(
+    scene: Scene, distance: Literal["cosine", "mse", "chord"], centre: MovingCentre | None = None
+) -> ImaginedReward:
     index = scene.object_index
     latents = object_centric(scene.model).object_latent(index + 1)
-    return ImaginedReward(TensorDictSequential(latents, LatentSimilarityReward(object_index=index, distance=distance)))
+    reward = LatentSimilarityReward(object_index=index, distance=distance, centre=centre)
+    return ImaginedReward(TensorDictSequential(latents, reward))

@@ -81,9 +81,10 @@ def match(goals: Tensor, latents: Tensor, positions: Tensor) -> dict[str, float]
         positions: ``[K, D]`` metres, of goals and latents.
 
     Returns:
-        ``cosine`` with the true latent and ``cosine_with_others``, means; ``median_rank``, ``mean_rank`` and
-        ``ranked_first``, of the true latent (:func:`ranks`); ``distance`` in metres between the position of a goal and
-        that of its best match, and ``distance_to_others`` between positions at all, means.
+        ``cosine`` with the true latent and ``cosine_with_others``, means, and ``contrast``, their difference: what of
+        the cosine is about the position, 0 for latents that are the same everywhere; ``median_rank``, ``mean_rank``
+        and ``ranked_first``, of the true latent (:func:`ranks`); ``distance`` in metres between the position of a goal
+        and that of its best match, and ``distance_to_others`` between positions at all, means.
 
     Examples:
         >>> match(torch.eye(2), 3 * torch.eye(2), torch.tensor([[0.0, 0.0], [0.0, 0.1]]))["ranked_first"]
@@ -101,4 +102,6 @@ def match(goals: Tensor, latents: Tensor, positions: Tensor) -> dict[str, float]
         "distance": apart.gather(1, best),
         "distance_to_others": apart[others],
     }
-    return {"median_rank": float(rank.quantile(0.5)), **{name: float(values.mean()) for name, values in means.items()}}
+    found = {name: float(values.mean()) for name, values in means.items()}
+    contrast = found["cosine"] - found["cosine_with_others"]
+    return {"median_rank": float(rank.quantile(0.5)), "contrast": contrast, **found}

@@ -116,6 +116,8 @@ _GOALS = "behaviours.reach.goals"
 _UNSEEN = {"world_model.observed": ["proprio"], "world_model.predicted": ["object_position"]}
 _IN_UNITS = {"behaviours.reach.reward.unit": "workspace"}
 _PAPERS_LCP = {"behaviours.reach.goal.weight": 1, "behaviours.reach.reward": "latent_similarity"}
+_CENTRED = {"behaviours.reach.reward.centred": True}
+_SHOWN = {_GOALS: "frames"}
 _TABLE = (
     *_both("dreamer"),
     _PCP,
@@ -196,10 +198,12 @@ FIGURES = {
         rows=(
             _PCP,
             Row(name="dreamer_pcp, position not observed", agent="dreamer_pcp", changes=_UNSEEN),
-            Row(name="dreamer_pcp, goals that the data shows", agent="dreamer_pcp", changes={_GOALS: "frames"}),
+            Row(name="dreamer_pcp, goals that the data shows", agent="dreamer_pcp", changes=_SHOWN),
             Row(name="dreamer_pcp, reward in workspace units", agent="dreamer_pcp", changes=_IN_UNITS),
             _LCP,
             Row(name="focus_lcp, cosine and weight 1", agent="focus_lcp", changes=_PAPERS_LCP, image_goals=True),
+            Row(name="focus_lcp, centred latents", agent="focus_lcp", changes=_CENTRED, image_goals=True),
+            Row(name="focus_lcp, goals that the data shows", agent="focus_lcp", changes=_SHOWN, image_goals=True),
         ),
         draws=("heatmap", "curves"),
     ),

@@ -8,7 +8,7 @@ from torchrl_ocwm.modules.future_goals import FutureGoals
 from torchrl_ocwm.modules.goals import FrameGoals, GivenGoals, MixedGoals, UniformGoals, UnitRMS
 from torchrl_ocwm.modules.imagination import ImaginationEnv
 from torchrl_ocwm.modules.latent import FullLatent, InitialLatent, LatentOfImages, LatentsInImages
-from torchrl_ocwm.modules.normalization import StreamingNorm
+from torchrl_ocwm.modules.normalization import MovingCentre, StreamingNorm
 from torchrl_ocwm.modules.object_world_model import ObjectWorldModel
 from torchrl_ocwm.modules.objects import LatentPositionalEncoder, ObjectDecoder, ObjectLatentExtractor
 from torchrl_ocwm.modules.observation import ObservationEncoder
@@ -44,6 +44,7 @@ __all__ = [
     "LatentSimilarityReward",
     "LatentsInImages",
     "MixedGoals",
+    "MovingCentre",
     "ObjectDecoder",
     "ObjectLatentExtractor",
     "ObjectWorldModel",

@@ -1,4 +1,4 @@
-"""Rewards on one scale, whatever their size."""
+"""Rewards on one scale, and latents around zero, whatever they were."""
 
 from __future__ import annotations
 
@@ -67,3 +67,48 @@ class StreamingNorm(nn.Module):
             spread = (self.square - self.mean.square()).clamp_min(self.epsilon**2).sqrt()
             return (values - self.mean) / spread
         return values
+
+
+class MovingCentre(nn.Module):
+    """Subtract the mean vector of what was seen.
+
+    Each call in training mode first takes its vectors into the mean: that of all calls so far, until these are
+    ``1 / rate``, and from then on an exponential moving average. In evaluation mode it stays as it is. It is saved with
+    the module. Gradients go through the vectors, not through the mean.
+
+    Args:
+        features: Length L of a vector.
+        rate: Share of the newest vectors in the mean.
+
+    Attributes:
+        mean: ``[L]`` float32.
+
+    Called with vectors ``[..., L]``; returns the same shape.
+
+    Examples:
+        >>> centre = MovingCentre(2)
+        >>> centre(torch.tensor([[1.0, 0.0], [3.0, 2.0]])), centre.eval()(torch.tensor([4.0, 1.0]))
+        (tensor([[-1., -1.],
+                [ 1.,  1.]]), tensor([2., 0.]))
+    """
+
+    mean: Tensor
+    calls: Tensor
+
+    def __init__(self, features: int, *, rate: float = 0.01) -> None:
+        super().__init__()
+        self.rate = rate
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("calls", torch.zeros(()))
+
+    @torch.no_grad()
+    def update(self, vectors: Tensor) -> None:
+        """Take vectors ``[..., L]`` into the mean."""
+        self.calls.add_(1)
+        self.mean.lerp_(vectors.float().flatten(0, -2).mean(0), (1 / self.calls).clamp_min(self.rate))
+
+    def forward(self, vectors: Tensor) -> Tensor:
+        """Vectors ``[..., L]`` without the mean; in training mode they are counted first."""
+        if self.training:
+            self.update(vectors)
+        return vectors - self.mean

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import cosine_similarity, normalize
 
 from torchrl_ocwm.modules.latent import FullLatent
+from torchrl_ocwm.modules.normalization import MovingCentre
 from torchrl_ocwm.modules.units import WorkspaceUnits
 from torchrl_ocwm.settings import read
 
@@ -74,17 +75,23 @@ class LatentSimilarity(nn.Module):
         object_index: Which object is to be positioned.
         distance: ``"cosine"``; ``"mse"``, the mean squared error; ``"chord"``, the distance between the two directions,
             √(2 − 2 cos), which keeps its slope up to the goal as a distance of positions does.
+        centre: Called with the directions ``[..., L]`` of the object's latents; what they have in common is taken from
+            both directions before they are compared (:class:`~torchrl_ocwm.modules.MovingCentre`). For chords.
 
     Called with object latents ``[..., O + 1, L]`` and goals ``[..., L]``; returns ``[..., 1]``.
 
     Raises:
-        ValueError: for another distance.
+        ValueError: for another distance, and for a centre where lengths count.
     """
 
-    def __init__(self, object_index: int = 0, distance: LatentReward = "cosine") -> None:
+    def __init__(
+        self, object_index: int = 0, distance: LatentReward = "cosine", centre: MovingCentre | None = None
+    ) -> None:
         super().__init__()
         read(LatentReward, distance, "distance")
-        self.object_index, self.distance = object_index, distance
+        if centre is not None and distance != "chord":
+            raise ValueError(f"only chords take a centre, not distance={distance!r}")
+        self.object_index, self.distance, self.centre = object_index, distance, centre
 
     def forward(self, object_latent: Tensor, goal: Tensor) -> Tensor:
         """The reward ``[..., 1]`` for latents of all objects ``[..., O, L]`` and goals ``[..., L]``."""
@@ -92,8 +99,14 @@ class LatentSimilarity(nn.Module):
         if self.distance == "cosine":
             return cosine_similarity(latent, goal, dim=-1).unsqueeze(-1)
         if self.distance == "chord":
-            return position_distance(normalize(latent, dim=-1), normalize(goal, dim=-1))
+            return self._chord(normalize(latent, dim=-1), normalize(goal, dim=-1))
         return -(latent - goal).square().mean(-1, keepdim=True)
+
+    def _chord(self, latent: Tensor, goal: Tensor) -> Tensor:
+        if self.centre is not None:
+            latent = normalize(self.centre(latent), dim=-1)
+            goal = normalize(goal - self.centre.mean, dim=-1)
+        return position_distance(latent, goal)
 
 
 class LatentSimilarityReward(TensorDictModule):
@@ -105,6 +118,7 @@ class LatentSimilarityReward(TensorDictModule):
         object_index: Which object is to be positioned; any of the scene.
         distance: Cosine similarity, or minus the mean squared error (``"mse"``) or the distance of the directions
             (``"chord"``).
+        centre: Taken from directions before a chord (:class:`LatentSimilarity`).
         object_latent_key: Extracted latents, ``[..., O + 1, L]``.
         goal_key: Goal latent, ``[..., L]``.
         reward_key: Key written, ``[..., 1]``.
@@ -123,11 +137,12 @@ class LatentSimilarityReward(TensorDictModule):
         *,
         object_index: int = 0,
         distance: LatentReward = "cosine",
+        centre: MovingCentre | None = None,
         object_latent_key: NestedKey = "object_latent",
         goal_key: NestedKey = ("latent", "goal"),
         reward_key: NestedKey = "reward",
     ) -> None:
-        similarity = LatentSimilarity(object_index, distance)
+        similarity = LatentSimilarity(object_index, distance, centre)
         super().__init__(similarity, in_keys=[object_latent_key, goal_key], out_keys=[reward_key])
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 GOALS = {
     "cosine": ("cosine", 3),
     "cosine_with_others": ("cosine with others", 3),
+    "contrast": ("contrast", 3),
     "median_rank": ("median rank", 1),
     "mean_rank": ("mean rank", 2),
     "ranked_first": ("ranked first", 2),
