@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -94,6 +95,16 @@ def test_a_whole_figure(work: Callable[..., list[str]], tmp_path: Path) -> None:
     for picture in ("heatmap", "curves"):
         assert f"![{picture}](reacher/{picture}.png)" in text
         assert (place / f"{picture}.png").stat().st_size > 1000
+    with (place / "curves.csv").open(newline="", encoding="utf-8") as lines:
+        curves = list(csv.reader(lines))
+    assert curves[0] == ["agent", "run", "updates", "final_score"]
+    assert {line[0] for line in curves[1:]} <= set(names)
+    logged = next((tmp_path / found[0].evaluated.trained.name).rglob("scalars/evaluation/final_score.csv"))
+    steps, scores = zip(*(line.split(",") for line in logged.read_text().split()), strict=True)
+    first = [line for line in curves if line[1] == Path(found[0].evaluated.trained.name).name]
+    assert [line[2] for line in first] == list(steps)
+    assert [float(line[3]) for line in first] == pytest.approx([float(score) for score in scores], abs=1e-4)
+    assert "(reacher/curves.csv)" in text
     assert "figure=table env=reacher size=debug seeds=1 steps=40 updates=2 goals=1" in text
     assert "`collect env=reacher" in text
     assert str(tmp_path) not in text

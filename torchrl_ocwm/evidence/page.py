@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 
 from torchrl_ocwm.envs import make_task
 from torchrl_ocwm.evaluation.output import writing
-from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, metric_lines
+from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, metric_lines, read_scalar
 from torchrl_ocwm.evaluation.report import COLUMNS, Report, ReportError
 from torchrl_ocwm.evidence.estimate import in_words
 from torchrl_ocwm.evidence.figures import FIGURES, Figure, Result
@@ -98,6 +99,7 @@ def _section(env: str, figure: Figure, done: Sequence[Result], root: Path, folde
         elif kind == "curves":
             if not learning_curves(place / "curves.png", _folders(done, root), CURVE):
                 continue
+            _save_curves(place / "curves.csv", _folders(done, root))
         else:
             metric_lines(place / "lines.png", _lines(figure, done, report), figure.places)
         pictures.append(f"![{kind}]({env}/{kind}.png)")
@@ -107,7 +109,21 @@ def _section(env: str, figure: Figure, done: Sequence[Result], root: Path, folde
         "middle half of all seeds and goals; in brackets its 95% interval, a stratified bootstrap over seeds for each "
         f"goal. Goal by goal: [results.json]({env}/results.json)."
     )
+    if f"![curves]({env}/curves.png)" in pictures:
+        text += f" Update by update: [curves.csv]({env}/curves.csv)."
     return [f"## {env}", report.markdown(intervals=True), text, *pictures]
+
+
+def _save_curves(path: Path, runs: dict[str, list[Path]]) -> None:
+    """The numbers of the curves: one line for each score of each run."""
+    metric = next(iter(CURVE))
+    with writing(path) as new, new.open("w", newline="", encoding="utf-8") as file:
+        lines = csv.writer(file)
+        lines.writerow(["agent", "run", "updates", metric.rpartition("/")[-1]])
+        for agent, folders in runs.items():
+            for folder in folders:
+                for updates, score in zip(*(read_scalar(folder, metric) or ((), ())), strict=True):
+                    lines.writerow([agent, folder.name, updates, f"{score:.4f}"])
 
 
 def _folders(done: Sequence[Result], root: Path) -> dict[str, list[Path]]:
