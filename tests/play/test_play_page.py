@@ -186,6 +186,14 @@ def test_it_is_served_to_this_machine_and_asks_nobody(page: Page, local_only: li
     assert local_only == []
 
 
+def test_a_machine_that_is_slow_to_answer_itself(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gradio.networking.url_ok", lambda address: False)
+    try:
+        assert urlopen(page.launch()).status == 200
+    finally:
+        page.close()
+
+
 def test_a_port_that_is_taken(page: Page) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))

@@ -75,6 +75,7 @@ class Page:
                 run_history=False,
                 quiet=True,
                 footer_links=[],
+                _frontend=False,  # or Gradio gives up if this machine takes three seconds to answer it
                 theme=_theme(),
                 css_paths=_HERE / "page.css",
             )
