@@ -460,7 +460,7 @@ def test_a_drag_moves_the_object_where_it_begins(cubes: Session) -> None:
 def test_who_can_act(make_agent: Callable[..., Agent], tmp_path: Path) -> None:
     file = str(save_agent(make_agent(), tmp_path / "agent.zip"))
     players = find_players([file, "cube_move/scripted", file])
-    scripted = ["cube_move/scripted", "reacher/scripted", "shelf_place/scripted", "pick_place/scripted"]
+    scripted = [f"{name}/scripted" for name in ("cube_move", "reacher", "cube_lift", "shelf_place", "pick_place")]
     names = [file, scripted[0], *shipped_agents(), *scripted[1:]]
     assert [player.name for player in players] == names
     assert [player.environment for player in players][:2] == ["reacher", "cube_move"]

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 
 from torchrl_ocwm.envs.cube_move import CubeMove
-from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.workspace import Workspace
-
-with needs("Cube lift", "robosuite"):
-    import mujoco
 
 _IN_HAND = np.array([0.02, -0.02])  # of the fingers around the cube, metres
 _ROUNDS, _DAMPING, _CLOSE = 50, 1e-3, 1e-5  # to find the joint angles of a pose; it takes about five rounds
