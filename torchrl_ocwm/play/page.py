@@ -227,7 +227,7 @@ class Page:
     def all(self) -> list[Any]:
         """Pictures, numbers and what there is to choose from."""
         player, behaviours = self.stage.player, self.stage.player.behaviours()
-        pictures = self.stage.do(Session.goal_pictures) if self.stage.do(lambda session: session.takes_images) else []
+        takes_images = self.stage.do(lambda session: session.takes_images)
         return [
             *self.frame(),
             *self.stage.do(_sliders),
@@ -235,8 +235,8 @@ class Page:
             player.environment,
             gr.Dropdown(self._agents(), value=player.name),
             gr.Dropdown(behaviours, value=self.stage.behaviour or behaviours[0][1]),
-            gr.Accordion(visible=bool(pictures)),
-            gr.Gallery(pictures),
+            gr.Accordion(visible=takes_images),
+            gr.Gallery(self.stage.do(Session.goal_pictures) if takes_images else []),
         ]
 
 
