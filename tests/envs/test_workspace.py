@@ -117,6 +117,13 @@ def test_grid_of_three_axes_is_a_square_grid_seen_along_each(size):
         assert len({tuple(cell) for cell in cells[:, view].long().tolist()}) == size**2
 
 
+def test_grid_of_three_axes_leaves_no_large_hole():
+    """No place of a cube is further from a goal than 0.3 of its side; goals in planes would leave 0.57."""
+    cube = Workspace(low=(0.0,) * 3, high=(1.0,) * 3)
+    places = cube.sample((20_000,), torch.Generator().manual_seed(0))
+    assert torch.cdist(places, cube.grid(10).flatten(0, 1)).amin(1).max() < 0.3
+
+
 def test_grid_of_two_axes_goes_along_the_first_then_the_second():
     grid = Workspace(low=(-1.0, 0.0), high=(1.0, 4.0)).grid(2)
     assert grid.tolist() == [[[-0.5, 1.0], [0.5, 1.0]], [[-0.5, 3.0], [0.5, 3.0]]]

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchrl_ocwm.settings import Settings, SettingsError
 
+_GOLDEN = (5**0.5 - 1) / 2
+
 
 @dataclass(frozen=True)
 class Workspace(Settings):
@@ -87,8 +89,8 @@ class Workspace(Settings):
     def grid(self, size: int) -> Tensor:
         """``[size, size, dim]`` goals that cover what can be reached, at the centres of equal cells (metres).
 
-        Two axes have a square grid. Three have ``size`` heights in turn, so that the goals are a whole square grid seen
-        along any axis; so do more, but not along all. One axis has a line of ``size * size`` goals.
+        Two axes have a square grid. With three, each cell of it has a height, so that the goals are a whole square grid
+        seen along any axis (a Latin square), and scattered in between. One axis has a line of ``size * size`` goals.
         """
         cells = size**2 if self.dim == 1 else size
         return self._lay_out(2 * (self.grid_cells(size) + 0.5) / cells - 1)
@@ -98,7 +100,9 @@ class Workspace(Settings):
         if self.dim == 1:
             return torch.arange(size**2).reshape(size, size, 1)
         row, column = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
-        return torch.stack([column, row, *((column + axis * row) % size for axis in range(1, self.dim - 1))], -1)
+        scattered = (torch.arange(size, dtype=torch.float64) * _GOLDEN % 1).argsort()
+        others = (scattered[(column + axis * scattered[row]) % size] for axis in range(1, self.dim - 1))
+        return torch.stack([column, row, *others], -1)
 
     def grid_edges(self, size: int, axes: tuple[int, int] = (0, 1)) -> Tensor:
         """``[size + 1, size + 1, 2]`` corners of the cells of :meth:`grid`, seen along all but two axes (metres)."""
