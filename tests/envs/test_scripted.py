@@ -19,9 +19,10 @@ def follow(tensordict):
     return tensordict.set("action", tensordict["scripted_action"])
 
 
-@pytest.mark.parametrize(("name", "steps"), [("reacher", 60), ("cube_move", 60), ("cube_lift", 40)])
+@pytest.mark.parametrize(("name", "steps"), [("reacher", 60), ("cube_move", 60), ("cube_lift", 25)])
 def test_script_reaches_the_landmarks(name, steps):
     env = gymnasium.make(ENVIRONMENTS[name].id, image_size=16, privileged=True).unwrapped
+    env.blind = True  # it looks at nothing
     for number, landmark in enumerate(env.workspace.landmarks):
         env.reset(seed=number, options={"goal_position": landmark})
         nearest = np.inf
