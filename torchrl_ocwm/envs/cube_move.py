@@ -7,7 +7,7 @@ import os
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -108,7 +108,7 @@ class CubeMove(PositioningEnv):
         ),
     )
     start = (0.0, 0.0, 0.82)  # the middle of a cube at rest
-    axes = (0, 1)
+    axes: ClassVar[tuple[int, ...]] = (0, 1)
     camera_name = "agentview"
     depth_offset = 0.013  # no bias on average over positions and turns of the cube, at 64 x 64 and at 256 x 256
 

@@ -33,36 +33,40 @@ def heatmap(path: str | Path, scores: dict[str, Tensor], workspace: Workspace, *
         workspace: The workspace that the grid covers.
         title: Written above.
     """
-    views = list(combinations(range(workspace.dim), 2)) or [(0, 0)]
+    views: list[tuple[int, int] | None] = [*combinations(range(workspace.dim), 2)] or [None]
     columns = len(views) if len(views) > 1 else 5
     figure, axes = _panels(len(scores) * len(views), columns=columns, width=3.2, height=3.4)
     for axis, ((name, values), view) in zip(axes, product(scores.items(), views), strict=True):
-        mesh = _draw_scores(axis, values, workspace, view)
+        drawn = _draw_strip(axis, values, workspace) if view is None else _draw_scores(axis, values, workspace, view)
         axis.set_title(fill(f"{name}: {values.nanmean():.2f}", 28))
-    figure.colorbar(mesh, ax=axes, label="score", shrink=0.8)
+    figure.colorbar(drawn, ax=axes, label="score", shrink=0.8)
     if title:
         figure.suptitle(title)
     save_figure(figure, path)
 
 
 def _draw_scores(axis: Axes, scores: Tensor, workspace: Workspace, view: tuple[int, int]) -> QuadMesh:
-    """The mean score of the goals in each cell, seen along all but two axes; a workspace of one axis is a strip."""
-    size, colours = round(len(scores) ** 0.5), {"vmin": 0, "vmax": 1, "cmap": "viridis"}
-    axis.set_xlabel("cm" if workspace.dim <= 2 else f"{_axis_name(workspace, view[0])}, cm")
-    if workspace.dim == 1:
-        axis.set_yticks([])
-        ends = torch.linspace(100 * workspace.low[0], 100 * workspace.high[0], len(scores) + 1)
-        return axis.pcolormesh(ends.numpy(), [0, 1], scores.unsqueeze(0).numpy(), **colours)
+    """The mean score of the goals in each cell, seen along all axes but these two."""
     if workspace.dim > 2:
         axis.set_ylabel(f"{_axis_name(workspace, view[1])}, cm")
+    axis.set_xlabel(f"{_axis_name(workspace, view[0])}, cm" if workspace.dim > 2 else "cm")
     axis.set_aspect("equal")
+    size = round(len(scores) ** 0.5)
     column, row = workspace.grid_cells(size).flatten(0, 1)[:, view].unbind(-1)
     total, count = (
-        torch.zeros(size, size).index_put((row, column), one, accumulate=True)
-        for one in (scores, torch.ones_like(scores))
+        torch.zeros(size, size).index_put((row, column), values.float(), accumulate=True)
+        for values in (scores, torch.ones_like(scores))
     )
     x, y = (100 * workspace.grid_edges(size, view)).unbind(-1)
-    return axis.pcolormesh(x.numpy(), y.numpy(), (total / count).numpy(), **colours)
+    return axis.pcolormesh(x.numpy(), y.numpy(), (total / count).numpy(), vmin=0, vmax=1, cmap="viridis")
+
+
+def _draw_strip(axis: Axes, scores: Tensor, workspace: Workspace) -> QuadMesh:
+    """The score of each goal on a line."""
+    axis.set_xlabel("cm")
+    axis.set_yticks([])
+    ends = np.linspace(100 * workspace.low[0], 100 * workspace.high[0], len(scores) + 1)
+    return axis.pcolormesh(ends, [0, 1], scores.unsqueeze(0).numpy(), vmin=0, vmax=1, cmap="viridis")
 
 
 def _axis_name(workspace: Workspace, axis: int) -> str:
