@@ -14,6 +14,10 @@ LONG := \
 	tests/training/test_stepper.py::test_update_compiles_into_one_graph[dreamer-changes0] \
 	tests/training/test_stepper.py::test_update_compiles_into_one_graph[dreamer_pcp-changes1] \
 	tests/envs/test_scripted.py::test_script_reaches_the_landmarks[cube_move-60] \
+	tests/envs/test_contract.py::test_gymnasium_checker[cube_lift] \
+	tests/envs/test_contract.py::test_starts_through_torchrl_depend_on_their_seeds_alone[cube_lift] \
+	tests/envs/test_contract.py::test_torchrl_specs_and_horizon[cube_lift] \
+	tests/examples/test_every_environment.py::test_from_dataset_to_film[cube_lift-focus_lcp] \
 	tests/examples/test_every_environment.py::test_from_dataset_to_film[pick_place-focus_lcp] \
 	tests/examples/test_stopping.py::test_ends_with_its_children[collect.py-9-False] \
 	tests/evaluation/test_episodes.py::test_process_that_dies_or_hangs_ends_the_evaluation[19] \

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import closing
+from itertools import combinations, product
 from pathlib import Path
 
 import gymnasium
 import matplotlib.pyplot as plt
 import numpy as np
 
-from torchrl_ocwm.envs import ENVIRONMENTS, PositioningEnv
+from torchrl_ocwm.envs import ENVIRONMENTS, PositioningEnv, Workspace
 
 SIZE = 480  # pixels
 AXIS = 0.3  # of the workspace's larger side
@@ -21,9 +23,8 @@ def draw(env: PositioningEnv, axes: plt.Axes) -> None:
     observation, _ = env.reset(seed=0)
     workspace = env.workspace
     axes.imshow(observation["pixels"].transpose(1, 2, 0), extent=(0, SIZE, SIZE, 0))
-    for lines in (workspace.grid_edges(10), workspace.grid_edges(10).transpose(0, 1)):
-        for line in lines:
-            axes.plot(*env.project(line.numpy()).T, color=GOALS, linewidth=0.4, alpha=0.7)
+    for line in cells(workspace) if workspace.dim == 2 else edges(workspace):
+        axes.plot(*env.project(line).T, color=GOALS, linewidth=0.4, alpha=0.7)
     goals = env.project(workspace.grid(10).flatten(0, 1).numpy())
     axes.scatter(*goals.T, s=6, color=GOALS, label="goals of the evaluation")
     landmarks = env.project(np.array(workspace.landmarks))
@@ -37,6 +38,18 @@ def draw(env: PositioningEnv, axes: plt.Axes) -> None:
         axes.annotate(name, xy=tip, color="#ff3b30", fontsize=12, xytext=(4, 4), textcoords="offset points")
     axes.set(xlim=(0, SIZE), ylim=(SIZE, 0), xticks=[], yticks=[])
     axes.legend(loc="lower right", fontsize=8)
+
+
+def cells(workspace: Workspace) -> Iterator[np.ndarray]:
+    """The lines of the grid that goals lie on."""
+    corners = workspace.grid_edges(10)
+    yield from (*corners.numpy(), *corners.transpose(0, 1).numpy())
+
+
+def edges(workspace: Workspace) -> Iterator[np.ndarray]:
+    """The edges of the box."""
+    corners = np.array(list(product(*zip(workspace.low, workspace.high, strict=True))))
+    yield from (np.array(pair) for pair in combinations(corners, 2) if (pair[0] != pair[1]).sum() == 1)
 
 
 def main() -> None:

@@ -35,8 +35,8 @@ class Case(NamedTuple):
     velocity: slice  # its part of proprio
     start_is_drawn: bool  # of the robot, not of the object alone
     actions: int
-    low: tuple[float, float]
-    high: tuple[float, float]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
     objects: tuple[str, ...]
     geom: str  # what is seen of the first object
     settles: float  # metres that it moves in a first step without an action
@@ -73,6 +73,12 @@ CUBE_MOVE = Case(
     package="robosuite",
     extra="robosuite",
 )
+CUBE_LIFT = CUBE_MOVE._replace(
+    low=(-0.2, -0.2, 0.0),
+    high=(0.2, 0.2, 0.2),
+    settles=0.013,  # it falls on the table
+    error=13,  # in the hand, which hides half of it
+)
 SHELF_PLACE = Case(
     proprio=7,
     velocity=slice(4, 7),
@@ -88,8 +94,23 @@ SHELF_PLACE = Case(
     extra="metaworld",
 )
 PICK_PLACE = SHELF_PLACE._replace(low=(-0.2, 0.0), high=(0.2, 0.15))
-CASES = {"reacher": REACHER, "cube_move": CUBE_MOVE, "shelf_place": SHELF_PLACE, "pick_place": PICK_PLACE}
-GOAL = np.array([0.1, 0.12], np.float32)  # in all workspaces
+CASES = {
+    "reacher": REACHER,
+    "cube_move": CUBE_MOVE,
+    "cube_lift": CUBE_LIFT,
+    "shelf_place": SHELF_PLACE,
+    "pick_place": PICK_PLACE,
+}
+
+
+def at(env: PositioningEnv, x: float, other: float) -> np.ndarray:
+    """A position with as many coordinates as the environment has: these, and then a height."""
+    return np.array([x, other, 0.15], np.float32)[: env.workspace.dim]
+
+
+def goal_of(env: PositioningEnv) -> np.ndarray:
+    """A goal in all workspaces."""
+    return at(env, 0.1, 0.12)
 
 
 def test_every_environment_is_here() -> None:
@@ -121,7 +142,7 @@ def twin(name: str) -> Iterator[PositioningEnv]:
     torch.manual_seed(1)
     for seed in (99, None):  # it has a past
         env.reset(seed=seed)
-        env.goal_observation(GOAL)
+        env.goal_observation(goal_of(env))
         for action in actions(env, 15):
             env.step(action)
     yield env
@@ -190,10 +211,10 @@ def test_observation_has_the_keys_shapes_and_types_of_the_contract(env: Position
         "pixels": ((3, 64, 64), np.uint8),
         "masks": ((1, 64, 64), np.bool_),
         "proprio": ((case.proprio,), np.float32),
-        "object_position": ((1, 2), np.float32),
+        "object_position": ((1, len(case.low)), np.float32),
         "object_visible": ((1,), np.bool_),
-        "goal_position": ((2,), np.float32),
-        "object_position_true": ((1, 2), np.float32),  # asked for
+        "goal_position": ((len(case.low),), np.float32),
+        "object_position_true": ((1, len(case.low)), np.float32),  # asked for
     }
     assert env.action_space == gymnasium.spaces.Box(-1, 1, (case.actions,), np.float32)
     assert env.observation_space.contains(observation)
@@ -210,11 +231,11 @@ def test_true_positions_are_privileged(env: PositioningEnv, name: str) -> None:
 
 
 def test_reward_is_minus_the_distance_in_metres(env: PositioningEnv) -> None:
-    env.reset(seed=2, options={"goal_position": GOAL})
+    env.reset(seed=2, options={"goal_position": goal_of(env)})
     for action in actions(env, 5):
         observation, reward, *_ = env.step(action)
-        x, y = (float(value) for value in observation["object_position"][0])
-        assert reward == pytest.approx(-np.hypot(x - 0.1, y - 0.12), abs=1e-6)
+        off = observation["object_position"][0].astype(float) - goal_of(env)
+        assert reward == pytest.approx(-((off**2).sum() ** 0.5), abs=1e-6)
 
 
 @pytest.mark.parametrize(("distance", "success"), [(0.0, True), (0.048, True), (0.052, False), (0.1, False)])
@@ -237,17 +258,17 @@ def test_success_within_five_centimetres(env: PositioningEnv, case: Case, distan
 
 
 def test_given_goal(env: PositioningEnv) -> None:
-    observation, _ = env.reset(options={"goal_position": GOAL})
-    assert np.array_equal(observation["goal_position"], GOAL)
-    assert np.array_equal(env.step(still(env))[0]["goal_position"], GOAL)
+    observation, _ = env.reset(options={"goal_position": goal_of(env)})
+    assert np.array_equal(observation["goal_position"], goal_of(env))
+    assert np.array_equal(env.step(still(env))[0]["goal_position"], goal_of(env))
     drawn, _ = env.reset()
-    assert not np.array_equal(drawn["goal_position"], GOAL)
+    assert not np.array_equal(drawn["goal_position"], goal_of(env))
 
 
 def test_given_goal_does_not_change_the_start(env: PositioningEnv) -> None:
     drawn, _ = env.reset(seed=5)
     following, _ = env.reset()
-    given, _ = env.reset(seed=5, options={"goal_position": GOAL})
+    given, _ = env.reset(seed=5, options={"goal_position": goal_of(env)})
     following_given, _ = env.reset()
     assert not np.array_equal(drawn.pop("goal_position"), given.pop("goal_position"))
     assert_same(drawn, given)
@@ -256,7 +277,7 @@ def test_given_goal_does_not_change_the_start(env: PositioningEnv) -> None:
 
 def test_goals_outside_the_workspace(env: PositioningEnv, case: Case) -> None:
     assert (env.workspace.low, env.workspace.high) == (case.low, case.high)
-    steps = 0.01 * np.eye(2)
+    steps = 0.01 * np.eye(len(case.low))
     for goal in [*(case.low - steps), *(case.high + steps)]:
         with pytest.raises(ValueError, match="lies outside the workspace"):
             env.reset(options={"goal_position": goal})
@@ -297,10 +318,10 @@ def test_starts_through_torchrl_depend_on_their_seeds_alone(env: PositioningEnv,
     make = partial(make_env, name, privileged=True)
     with closing(SerialEnv(2, make, device=None)) as envs:
         for seeds in ((21, 22), (22, 21), (23, 21)):
-            goals = [{"seed": seed, "options": {"goal_position": GOAL}} for seed in seeds]
+            goals = [{"seed": seed, "options": {"goal_position": goal_of(env)}} for seed in seeds]
             starts = envs.reset(list_of_kwargs=goals)
             for start, seed in zip(starts, seeds, strict=True):
-                alone, _ = env.reset(seed=seed, options={"goal_position": GOAL})
+                alone, _ = env.reset(seed=seed, options={"goal_position": goal_of(env)})
                 assert_same(alone, {key: start[key].numpy() for key in alone})
             envs.rollout(3)
 
@@ -332,7 +353,7 @@ def test_closing_frees_the_simulator_at_once(name: str, wrap: Callable) -> None:
         env = wrap(name)
         env.reset()
         inner = env.unwrapped if isinstance(env, gymnasium.Env) else env.base_env._env.unwrapped
-        inner.goal_observation(GOAL)
+        inner.goal_observation(goal_of(inner))
         large = [weakref.ref(part) for part in (inner.model, inner.data, inner._scratch, inner.camera._scene)]
         env.close()
         assert [part() for part in large] == [None] * 4
@@ -344,7 +365,7 @@ def test_a_closed_environment_says_so(name: str) -> None:
     env = gymnasium.make(ENVIRONMENTS[name].id, image_size=16, render_mode="rgb_array").unwrapped
     env.reset()
     env.close()
-    for use in (env.reset, env.render, lambda: env.step(still(env)), lambda: env.goal_observation(GOAL)):
+    for use in (env.reset, env.render, lambda: env.step(still(env)), lambda: env.goal_observation(goal_of(env))):
         with pytest.raises(RuntimeError, match="this environment is closed"):
             use()
 
@@ -379,18 +400,18 @@ def test_a_body_that_leaves_the_world_ends_the_episode(env: PositioningEnv) -> N
 
 
 def test_hidden_object_keeps_its_last_position(env: PositioningEnv, case: Case, hide: Callable[..., None]) -> None:
-    env.reset(seed=14, options={"goal_position": GOAL})
-    env._teleport(env.data, np.array([-0.1, 0.1]), 0)
+    env.reset(seed=14, options={"goal_position": goal_of(env)})
+    env._teleport(env.data, at(env, -0.1, 0.1), 0)
     seen, *_ = env.step(still(env))
     hide()
-    env._teleport(env.data, env._check_goal(GOAL), 0)
+    env._teleport(env.data, env._check_goal(goal_of(env)), 0)
     for _ in range(2):
         hidden, reward, *_ = env.step(still(env))
         assert hidden["object_visible"].tolist() == [False]
         assert not hidden["masks"].any()
         assert np.array_equal(hidden["object_position"], seen["object_position"])
         assert error(hidden) > 20
-        assert reward == pytest.approx(-np.linalg.norm(seen["object_position"][0] - GOAL), abs=1e-6)
+        assert reward == pytest.approx(-np.linalg.norm(seen["object_position"][0] - goal_of(env)), abs=1e-6)
     hide(False)
     again, *_ = env.step(still(env))
     assert again["object_visible"].tolist() == [True]
@@ -419,15 +440,15 @@ def test_hidden_from_the_start_is_zero(env: PositioningEnv, hide: Callable[..., 
     hide()
     observation, _ = env.reset(seed=16)
     assert observation["object_visible"].tolist() == [False]
-    assert observation["object_position"].tolist() == [[0.0, 0.0]]
+    assert observation["object_position"].tolist() == [[0.0] * env.workspace.dim]
 
 
 def test_positions_hold_when_the_camera_moves(env: PositioningEnv, case: Case) -> None:
-    env.reset(seed=27, options={"goal_position": GOAL})
-    before = env.project(GOAL)
+    env.reset(seed=27, options={"goal_position": goal_of(env)})
+    before = env.project(goal_of(env))
     env.data.cam_xpos[env.camera.camera_id] += (0.04, 0.04, 0.0)
     assert error(env._observe(env.data)) < case.error
-    assert np.linalg.norm(env.project(GOAL) - before) > 1
+    assert np.linalg.norm(env.project(goal_of(env)) - before) > 1
     env.reset()
 
 
@@ -438,7 +459,7 @@ def test_virtual_target_changes_nothing_but_pixels(
     env: PositioningEnv, twin: PositioningEnv, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(twin, "virtual_target", 16)
-    start = {"seed": 17, "options": {"goal_position": (-0.1, 0.12)}}
+    start = {"seed": 17, "options": {"goal_position": at(env, -0.1, 0.12)}}
     for plain, painted in [
         (env.reset(**start)[0], twin.reset(**start)[0]),
         (env.step(still(env))[0], twin.step(still(env))[0]),
@@ -468,7 +489,7 @@ def test_goal_observation_shows_the_object_at_the_goal(env: PositioningEnv, case
         env.step(np.array([1.0, 0.0, -1.0, 1.0])[: case.actions])  # a gripper reaches down over the table
     goals = env.workspace.grid(4).flatten(0, 1).tolist()
     if env.workspace.reach is None:
-        goals += product(*np.linspace(case.low, case.high, 3).T)  # corners, edges and the middle
+        goals += product(*np.linspace(case.low, case.high, 3).T)  # corners, edges, faces and the middle
     for goal in goals:
         observation = env.goal_observation(np.array(goal))
         assert env.observation_space.contains(observation)
@@ -481,10 +502,10 @@ def test_goal_observation_shows_the_object_at_the_goal(env: PositioningEnv, case
 
 def test_goal_observation_does_not_depend_on_the_episode(env: PositioningEnv) -> None:
     env.reset(seed=18)
-    first = env.goal_observation(GOAL)
+    first = env.goal_observation(goal_of(env))
     for action in actions(env, 5):
         env.step(action)
-    assert_same(first, env.goal_observation(GOAL))
+    assert_same(first, env.goal_observation(goal_of(env)))
 
 
 def test_goal_observation_leaves_the_episode_alone(env: PositioningEnv, twin: PositioningEnv) -> None:
@@ -493,7 +514,7 @@ def test_goal_observation_leaves_the_episode_alone(env: PositioningEnv, twin: Po
     for action in actions(env, 6):
         before = state(env)
         for goal in [(0.15, 0.05), (-0.1, 0.1)]:
-            env.goal_observation(np.array(goal))
+            env.goal_observation(at(env, *goal))
         assert np.array_equal(state(env), before)
         first, second = env.step(action), twin.step(action)
         assert_same(first[0], second[0])
@@ -505,42 +526,42 @@ def test_goal_observation_leaves_the_episode_alone(env: PositioningEnv, twin: Po
 
 
 def test_another_goal_in_a_running_episode(env: PositioningEnv, twin: PositioningEnv) -> None:
-    env.reset(seed=20, options={"goal_position": GOAL})
-    twin.reset(seed=20, options={"goal_position": -GOAL * (1, -1)})
+    env.reset(seed=20, options={"goal_position": goal_of(env)})
+    twin.reset(seed=20, options={"goal_position": at(env, -0.1, 0.05)})
     before = state(env)
-    observation = env.set_goal((-0.1, 0.12))
+    observation = env.set_goal(at(env, -0.1, 0.12))
     assert np.array_equal(state(env), before)
-    assert env.goal_position == pytest.approx(np.array([-0.1, 0.12]))
-    assert_same(observation, twin.set_goal((-0.1, 0.12)))
+    assert env.goal_position == pytest.approx(at(env, -0.1, 0.12))
+    assert_same(observation, twin.set_goal(at(env, -0.1, 0.12)))
     first, second = env.step(still(env)), twin.step(still(env))
     assert_same(first[0], second[0])
-    assert first[1] == second[1] == pytest.approx(-np.hypot(*(first[0]["object_position"][0] - (-0.1, 0.12))))
+    assert first[1] == second[1] == pytest.approx(-np.linalg.norm(first[0]["object_position"][0] - at(env, -0.1, 0.12)))
     with pytest.raises(ValueError, match="outside the workspace"):
-        env.set_goal((0.1, 1.0))
-    assert env.goal_position == pytest.approx(np.array([-0.1, 0.12]))
+        env.set_goal(at(env, 0.1, 1.0))
+    assert env.goal_position == pytest.approx(at(env, -0.1, 0.12))
 
 
 def test_a_moved_object_is_there_and_the_episode_goes_on(env: PositioningEnv, case: Case) -> None:
-    env.reset(seed=21, options={"goal_position": GOAL})
+    env.reset(seed=21, options={"goal_position": goal_of(env)})
     env.step(still(env))
     fixed = sorted({0, 1, 2} - set(env.axes))
     before = env._true_position(env.data)[0, fixed]
-    observation = env.move_object((-0.1, 0.05))
-    assert observation["object_position_true"][0] == pytest.approx(np.array([-0.1, 0.05]), abs=1e-6)
+    observation = env.move_object(at(env, -0.1, 0.05))
+    assert observation["object_position_true"][0] == pytest.approx(at(env, -0.1, 0.05), abs=1e-6)
     assert env._true_position(env.data)[0, fixed] == pytest.approx(before, abs=1e-6)
-    assert observation["goal_position"] == pytest.approx(GOAL)
+    assert observation["goal_position"] == pytest.approx(goal_of(env))
     assert error(observation) < case.error
     after = env.step(still(env))[0]["object_position_true"][0]
     assert abs(after[0] + 0.1) < 0.01  # and it does not fly away; in the air it falls
     with pytest.raises(ValueError, match="outside the workspace"):
-        env.move_object((1.0, 0.0))
+        env.move_object(at(env, 1.0, 0.0))
     with pytest.raises(ValueError, match=f"object_index must be below {len(case.objects)}"):
-        env.move_object(GOAL, len(case.objects))
+        env.move_object(goal_of(env), len(case.objects))
 
 
 def test_a_hidden_object_keeps_the_place_it_was_moved_to(env: PositioningEnv, hide: Callable[..., None]) -> None:
     env.reset(seed=22)
-    seen = env.move_object((-0.1, 0.05))["object_position"]
+    seen = env.move_object(at(env, -0.1, 0.05))["object_position"]
     hide()
     assert np.array_equal(env.step(still(env))[0]["object_position"], seen)
 
@@ -548,10 +569,11 @@ def test_a_hidden_object_keeps_the_place_it_was_moved_to(env: PositioningEnv, hi
 def test_what_is_seen_at_a_point_of_the_image_is_the_inverse_of_where_it_is(env: PositioningEnv) -> None:
     env.reset(seed=23)
     places = env.workspace.grid(4).numpy()
+    places[..., 2:] = height = 0.1
     points = env.project(places)
     assert points.std(axis=(0, 1)).min() > 2  # pixels
-    assert env.unproject(points) == pytest.approx(places, abs=1e-5)
-    assert env.unproject(points[1, 2].tolist()) == pytest.approx(places[1, 2], abs=1e-5)
+    assert env.unproject(points, height) == pytest.approx(places, abs=1e-5)
+    assert env.unproject(points[1, 2].tolist(), height) == pytest.approx(places[1, 2], abs=1e-5)
 
 
 # Names.
@@ -572,8 +594,9 @@ def test_missing_simulator_says_what_to_install(monkeypatch: pytest.MonkeyPatch,
         patch.setattr(registry, "find_spec", lambda module: None if module == case.package else True)
         with pytest.raises(ModuleNotFoundError, match=f"'{name}' {what}"):
             make_env(name)
-    module = ENVIRONMENTS[name].entry_point.split(":")[0]
-    monkeypatch.delitem(sys.modules, module, raising=False)
+    module, *others = (ENVIRONMENTS[one].entry_point.split(":")[0] for one in (name, *CASES))
+    for loaded in others:  # one may build on another
+        monkeypatch.delitem(sys.modules, loaded, raising=False)
     for loaded in [case.package, *(loaded for loaded in sys.modules if loaded.startswith(f"{case.package}."))]:
         monkeypatch.setitem(sys.modules, loaded, None)
     with pytest.raises(ModuleNotFoundError, match=what):

@@ -19,9 +19,10 @@ def follow(tensordict):
     return tensordict.set("action", tensordict["scripted_action"])
 
 
-@pytest.mark.parametrize(("name", "steps"), [("reacher", 60), ("cube_move", 60)])
+@pytest.mark.parametrize(("name", "steps"), [("reacher", 60), ("cube_move", 60), ("cube_lift", 25)])
 def test_script_reaches_the_landmarks(name, steps):
     env = gymnasium.make(ENVIRONMENTS[name].id, image_size=16, privileged=True).unwrapped
+    env.blind = True  # it looks at nothing
     for number, landmark in enumerate(env.workspace.landmarks):
         env.reset(seed=number, options={"goal_position": landmark})
         nearest = np.inf
@@ -41,6 +42,7 @@ def test_script_reaches_the_landmarks(name, steps):
         ("cube_move", (0.05, 0.0, 0.0)),
         ("cube_move", (0.0, -0.05, 0.03)),
         ("cube_move", (0.0, 0.0, 0.07)),
+        ("cube_lift", (0.05, 0.0, 0.07)),
         ("shelf_place", (0.06, 0.0, 0.08)),
         ("pick_place", (0.06, 0.0, 0.08)),
     ],
@@ -51,7 +53,7 @@ def test_a_hand_that_misses_goes_to_the_goal_without_the_object(name, error):
     env.reset(seed=0, options={"goal_position": goal})
     for _ in range(60):
         observation, *_ = env.step(env.scripted_action(error=error))
-    hand = env.data.site_xpos[env._gripper] if name == "cube_move" else env.data.xpos[env._hand]
+    hand = env.data.site_xpos[env._gripper] if name.startswith("cube_") else env.data.xpos[env._hand]
     assert (hand - env._start)[0] == pytest.approx(goal[0], abs=0.02)
     assert np.linalg.norm(observation["object_position_true"][0] - goal) > 0.08
     env.close()

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from torchrl_ocwm.envs import Task, Workspace
+from torchrl_ocwm.settings import SettingsError
 
 RING = Workspace(low=(-0.24, -0.24), high=(0.24, 0.24), reach=(0.04, 0.24))
 BOX = Workspace(low=(-1.0, 0.0, 0.5), high=(1.0, 0.4, 2.5))
@@ -104,14 +105,51 @@ def test_grid_points_are_the_middles_of_their_cells():
     assert torch.allclose(RING.grid(5), RING.grid_edges(10)[1::2, 1::2])
 
 
-def test_grid_of_a_box_spans_the_first_and_last_axis():
-    grid = BOX.grid(2)
-    assert torch.allclose(grid[0, 0], torch.tensor([-0.5, 0.2, 1.0]))
-    assert torch.allclose(grid[0, 1], torch.tensor([0.5, 0.2, 1.0]))
-    assert torch.allclose(grid[1, 0], torch.tensor([-0.5, 0.2, 2.0]))
-    edges = BOX.grid_edges(2)
-    assert torch.allclose(edges[0, 0], torch.tensor([-1.0, 0.2, 0.5]))
-    assert torch.allclose(edges[2, 2], torch.tensor([1.0, 0.2, 2.5]))
+@pytest.mark.parametrize("size", [1, 2, 5, 6, 10])
+def test_grid_of_three_axes_is_a_square_grid_seen_along_each(size):
+    goals = BOX.grid(size).flatten(0, 1)
+    assert goals.shape == (size**2, 3)
+    low, high = torch.tensor(BOX.low), torch.tensor(BOX.high)
+    cells = (goals - low) / (high - low) * size
+    torch.testing.assert_close(cells % 1, torch.full_like(cells, 0.5), atol=1e-4, rtol=0)  # middles
+    assert torch.equal(cells.long(), BOX.grid_cells(size).flatten(0, 1))
+    for view in ((0, 1), (0, 2), (1, 2)):
+        assert len({tuple(cell) for cell in cells[:, view].long().tolist()}) == size**2
+
+
+def test_grid_of_three_axes_leaves_no_large_hole():
+    """No place of a cube is further from a goal than 0.3 of its side; goals in planes would leave 0.57."""
+    cube = Workspace(low=(0.0,) * 3, high=(1.0,) * 3)
+    places = cube.sample((20_000,), torch.Generator().manual_seed(0))
+    assert torch.cdist(places, cube.grid(10).flatten(0, 1)).amin(1).max() < 0.3
+
+
+def test_grid_of_two_axes_goes_along_the_first_then_the_second():
+    grid = Workspace(low=(-1.0, 0.0), high=(1.0, 4.0)).grid(2)
+    assert grid.tolist() == [[[-0.5, 1.0], [0.5, 1.0]], [[-0.5, 3.0], [0.5, 3.0]]]
+
+
+def test_grid_of_one_axis_is_a_line():
+    assert Workspace(low=(0.0,), high=(8.0,)).grid(2).flatten().tolist() == [1.0, 3.0, 5.0, 7.0]
+
+
+def test_grid_of_four_axes_takes_each_value_equally_often():
+    cells = Workspace(low=(0.0,) * 4, high=(1.0,) * 4).grid_cells(6).flatten(0, 1)
+    for axis in cells.T:
+        assert axis.bincount().tolist() == [6] * 6
+
+
+def test_edges_seen_along_an_axis():
+    edges = BOX.grid_edges(2, (0, 2))
+    assert edges[0, 0].tolist() == [-1.0, 0.5]
+    assert edges[0, 2].tolist() == [1.0, 0.5]
+    assert edges[2, 2].tolist() == [1.0, 2.5]
+    assert BOX.grid_edges(2, (1, 2))[2, 0].tolist() == pytest.approx([0.0, 2.5])
+
+
+def test_a_ring_has_two_axes():
+    with pytest.raises(SettingsError, match="reach is the ring of a planar arm: it needs two axes, low has 3"):
+        Workspace(BOX.low, BOX.high, reach=(0.1, 0.2))
 
 
 @pytest.mark.parametrize("workspace", [RING, BOX, Workspace((-1.0,), (1.0,), landmarks=((0.5,), (-0.5,)))])

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torchrl.record.loggers import CSVLogger
 
+from torchrl_ocwm.envs import Workspace
 from torchrl_ocwm.evaluation import Report, plots
 from torchrl_ocwm.evaluation.imagined import imagined_rollout
 from torchrl_ocwm.evaluation.output import OutputError
@@ -39,6 +40,45 @@ def test_heatmap_of_many_agents_has_rows(tmp_path: Path) -> None:
     one, seven = (imageio.imread(tmp_path / f"{number}.png") for number in (1, 7))
     assert seven.shape[0] > 1.5 * one.shape[0]
     assert seven.shape[1] < 6 * one.shape[1]
+
+
+YELLOW, BLUE = (253, 231, 36), (68, 1, 84)
+
+
+def panels(file: Path) -> list[np.ndarray]:
+    """Where a heatmap of scores 0 and 1 is yellow, panel by panel from the left, as shares ``[H, W]`` of it."""
+    image = imageio.imread(file)[..., :3].astype(int)
+    yellow, blue = (abs(image - colour).sum(-1) < 30 for colour in (YELLOW, BLUE))
+    filled = yellow | blue
+    columns = filled.sum(0) > 20
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], columns, [0]]))).reshape(-1, 2)
+    found = []
+    for left, right in ends[ends[:, 1] - ends[:, 0] > 50]:  # the bar is narrower
+        rows = np.flatnonzero(filled[:, left:right].sum(1) > 0.5 * (right - left))
+        found.append(yellow[rows[0] : rows[-1] + 1, left:right])
+    return found
+
+
+def test_heatmap_of_three_axes_is_seen_along_each(tmp_path: Path) -> None:
+    """Three panels, from the left x and y, x and z, y and z; in each every goal is where it lies."""
+    size, workspace = 6, Workspace(low=(-0.2, -0.2, 0.0), high=(0.2, 0.2, 0.4))
+    goals = workspace.grid(size).flatten(0, 1)
+    reached = torch.rand(len(goals), generator=torch.Generator().manual_seed(0)) > 0.5
+    heatmap(tmp_path / "map.png", {"agent": reached.float()}, workspace)
+    seen = panels(tmp_path / "map.png")
+    assert len(seen) == 3
+    for view, yellow in zip(((0, 1), (0, 2), (1, 2)), seen, strict=True):
+        shares = (goals - torch.tensor(workspace.low))[:, view] / 0.4
+        columns, rows = (shares * torch.tensor(yellow.shape[::-1])).long().T.numpy()
+        assert yellow[-rows, columns].tolist() == reached.tolist()
+
+
+def test_heatmap_of_one_axis_is_a_strip(tmp_path: Path) -> None:
+    workspace = Workspace(low=(-0.2,), high=(0.2,))
+    heatmap(tmp_path / "map.png", {"agent": (workspace.grid(4)[..., 0] > 0.1).float().flatten()}, workspace)
+    (yellow,) = panels(tmp_path / "map.png")
+    assert yellow.mean() == pytest.approx(0.25, abs=0.03)
+    assert yellow[:, 3 * yellow.shape[1] // 4 + 3 :].mean() > 0.95
 
 
 def test_learning_curves(tmp_path: Path) -> None:

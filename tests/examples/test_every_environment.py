@@ -52,7 +52,12 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
 #: Those that only explore do so in test_exploration.py.
 REACHING = [name for name, row in AGENTS.items() if row.acting == REACH]
 #: What environments show differs in shapes and objects only, so that one agent with each world model is enough.
-ELSEWHERE = {"cube_move": "focus_lcp", "shelf_place": "dreamer_pcp", "pick_place": "focus_lcp"}
+ELSEWHERE = {
+    "cube_move": "focus_lcp",
+    "cube_lift": "focus_lcp",
+    "shelf_place": "dreamer_pcp",
+    "pick_place": "focus_lcp",
+}
 PAIRS = [*(("reacher", agent) for agent in REACHING), *ELSEWHERE.items()]
 
 

@@ -105,6 +105,25 @@ def test_a_drag_moves_the_object(page: Page) -> None:
     assert session_of(page).env.true_position()[0] == pytest.approx(np.array([-0.1, 0.15]), abs=1e-5)
 
 
+@pytest.mark.slow
+def test_clicks_and_drags_keep_heights() -> None:
+    with Stage([Player("cube_lift/scripted", "cube_lift")]) as stage:
+        page = Page(stage)
+        page.slide(False, 5.0, -5.0, 12.5)
+        session, scene = session_of(page), session_of(page).env
+        assert session.goal == pytest.approx(np.array([0.05, -0.05, 0.125]))
+        place = stage.do(lambda session: session.places.point(np.array([0.1, 0.1, 0.125])))
+        *_, z = page.click(False, event(begin=place, to=place))
+        assert session.goal == pytest.approx(np.array([0.1, 0.1, 0.125]), abs=1e-5)
+        assert (z.value, z.visible, z.minimum, z.maximum, z.label) == (12.5, True, 0, 20, "Goal z, cm")
+        stage.do(lambda session: session.move_object((0.0, 0.1, 0.1)))
+        begin, end = (
+            stage.do(lambda session, y=y: session.places.point(np.array([0.0, y, 0.1]))) for y in (0.1, -0.15)
+        )
+        page.drag(event(begin=begin, to=end))
+        assert scene.true_position()[0] == pytest.approx(np.array([0.0, -0.15, 0.1]), abs=1e-5)
+
+
 def test_a_tick_is_a_step_unless_it_stands_still(page: Page) -> None:
     for running, steps in ((True, 1), (False, 1), (True, 2)):
         page.running = running

@@ -391,6 +391,39 @@ def test_the_scripted_policy_believes_nothing(session: Session) -> None:
     assert (view.imagined, view.masks, view.believed, view.expected) == (None, None, None, None)
 
 
+# Goals with a height.
+
+
+@pytest.fixture(scope="module")
+def lift() -> Iterator[Session]:
+    with Session("cube_lift", options={"image_size": 32}, size=64) as session:
+        yield session
+
+
+def test_a_click_keeps_the_height_of_the_goal(lift: Session) -> None:
+    lift.set_goal((0.0, 0.1, 0.15))
+    place = lift.places.point(np.array([0.1, -0.05, 0.15]))
+    lift.set_goal(lift.places.position(place, lift.env.goal_position))
+    assert lift.goal == pytest.approx(np.array([0.1, -0.05, 0.15]), abs=1e-5)
+    assert lift.view().goal == pytest.approx(place, abs=1e-5)
+    on_the_table = lift.places.position(lift.places.point(np.array([0.1, -0.05, 0.0])))
+    assert on_the_table == pytest.approx(np.array([0.1, -0.05, 0.0]), abs=1e-5)
+
+
+def test_the_line_around_the_workspace_is_as_high_as_the_goal(lift: Session) -> None:
+    low, high = lift.env.workspace.low, lift.env.workspace.high
+    for height in (0.0, 0.12):
+        lift.set_goal((0.0, 0.1, height))
+        expected = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
+        for corner, (x, y) in zip(lift.view().workspace, expected, strict=True):
+            assert corner == pytest.approx(lift.places.point(np.array([x, y, height])), abs=1e-5)
+
+
+def test_an_object_is_put_into_the_air(lift: Session) -> None:
+    lift.move_object((0.1, -0.1, 0.15))
+    assert lift.env.true_position()[0] == pytest.approx(np.array([0.1, -0.1, 0.15]), abs=1e-5)
+
+
 # Two objects.
 
 
@@ -427,7 +460,7 @@ def test_a_drag_moves_the_object_where_it_begins(cubes: Session) -> None:
 def test_who_can_act(make_agent: Callable[..., Agent], tmp_path: Path) -> None:
     file = str(save_agent(make_agent(), tmp_path / "agent.zip"))
     players = find_players([file, "cube_move/scripted", file])
-    scripted = ["cube_move/scripted", "reacher/scripted", "shelf_place/scripted", "pick_place/scripted"]
+    scripted = [f"{name}/scripted" for name in ("cube_move", "reacher", "cube_lift", "shelf_place", "pick_place")]
     names = [file, scripted[0], *shipped_agents(), *scripted[1:]]
     assert [player.name for player in players] == names
     assert [player.environment for player in players][:2] == ["reacher", "cube_move"]

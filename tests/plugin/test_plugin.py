@@ -6,10 +6,13 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torchrl.checkpoint import CheckpointError
@@ -18,7 +21,7 @@ from torchrl_ocwm import build_agent, load_agent, make_env, make_task
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, Behaviour, collecting_policy, save_agent
 from torchrl_ocwm.agents.checkpoint import describe, read_parts
 from torchrl_ocwm.data import Collection, EpisodeDataset, collect
-from torchrl_ocwm.envs import EnvChoice, find_environment
+from torchrl_ocwm.envs import EnvChoice, find_environment, make_scene, registry
 from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.evaluation import EvaluationEnvs
 from torchrl_ocwm.parts import VARIABLE, load_plugins
@@ -205,3 +208,82 @@ def test_from_collected_data_to_a_table(tmp_path: Path) -> None:
     acts = collecting_policy(more, "dots", options)
     with collect(data, "dots", more, policy=acts, options=options, progress=False) as dataset:
         assert list(dataset.metadata["policies"].values()) == [4, 1]
+
+
+# An environment of gymnasium-robotics, which the other package wraps in one file.
+
+fetch_installed = pytest.mark.skipif(
+    find_spec("gymnasium_robotics") is None,
+    reason="gymnasium-robotics is not installed: pip install gymnasium-robotics",
+)
+
+
+@pytest.fixture(scope="module")
+def fetch() -> Iterator[Any]:
+    scene = make_scene(find_environment("fetch_pick_place"), privileged=True, action_repeat=1)
+    yield scene
+    scene.close()
+
+
+def off(observation: dict[str, np.ndarray]) -> float:
+    """Of the estimated position, metres."""
+    return float(np.linalg.norm(observation["object_position"] - observation["object_position_true"]))
+
+
+def test_what_to_install_for_an_environment_of_another_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "find_spec", lambda module: None if module == "gymnasium_robotics" else True)
+    with pytest.raises(MissingPackageError, match="'fetch_pick_place' needs gymnasium_robotics.*pip install gymnas"):
+        make_env("fetch_pick_place")
+
+
+@fetch_installed
+def test_starts_and_physics_are_those_of_gymnasium_robotics(fetch: Any) -> None:
+    from gymnasium_robotics.envs.fetch.pick_and_place import MujocoFetchPickAndPlaceEnv
+
+    original = MujocoFetchPickAndPlaceEnv()
+    fetch.reset(seed=3)
+    original.reset(seed=3)
+    original.np_random.bit_generator.state = np.random.default_rng(3).bit_generator.state
+    original.np_random.uniform(size=3)  # the goal
+    original._reset_sim()
+    assert np.array_equal(fetch.data.qpos, original.data.qpos)
+    for action in np.random.default_rng(0).uniform(-1, 1, (8, 4)):
+        observation, *_ = fetch.step(action)
+        original.step(action)
+        assert np.array_equal(fetch.data.qpos, original.data.qpos)
+    block = original._get_obs()["achieved_goal"] - fetch.start
+    assert observation["object_position_true"][0] == pytest.approx(block, abs=1e-6)
+    assert off(observation) < 0.02
+    original.close()
+
+
+@fetch_installed
+def test_goal_images_of_gymnasium_robotics_show_the_block_there(fetch: Any) -> None:
+    fetch.reset(seed=4)
+    for goal in fetch.workspace.grid(4).flatten(0, 1).numpy():
+        observation = fetch.goal_observation(goal)
+        assert observation["object_position_true"][0] == pytest.approx(goal, abs=1e-6)
+        assert observation["object_visible"].all()
+        assert off(observation) < 0.02
+
+
+@fetch_installed
+@pytest.mark.slow
+def test_gymnasium_robotics_from_collected_data_to_a_table(
+    command: Callable[..., str], recwarn: pytest.WarningsRecorder
+) -> None:
+    """It has no landmarks: training says so once, and goes on. Goals of the evaluation have three coordinates."""
+    env = ("env=fetch_pick_place", "dataset=data")
+    options = ("env.options.horizon=15", "env.options.image_size=32")
+    assert "45 steps in 3 episodes" in command("collect", *env, "steps=45", "workers=1", *options)
+    short = ("size=debug", "training.updates=2", "training.eval_interval=1", "training.video_interval=0")
+    command("train_offline", *env, "agent=focus_lcp", *short, "output=run")
+    assert len([one for one in recwarn if "'fetch_pick_place' has no landmark goals" in str(one.message)]) == 1
+    small = ("goals=4", "episode_steps=3", "workers=0", "envs=1", "video_goals=1", "image_goals=true")
+    command("evaluate", "checkpoint=run/checkpoint.zip", *small, "output=evaluation")
+    results = json.loads(Path("evaluation", "results.json").read_text())
+    workspace = make_task("fetch_pick_place").workspace
+    torch.testing.assert_close(torch.tensor(results["goals"]), workspace.grid(2).flatten(0, 1))
+    assert list(results["agents"]) == ["random", "focus_lcp", "focus_lcp, image goals"]
+    assert all(0 < score < 1 for score in results["agents"]["focus_lcp"]["per_goal"][0]["final_score"])
+    assert Path("evaluation", "heatmap.png").stat().st_size > 1000

@@ -30,7 +30,7 @@ collect dataset=null                               dataset must be a text, got N
 collect dataset=[a,b]                              dataset must be a text, got ['a', 'b']
 collect dataset=???                                dataset is missing
 collect env=null                                   env must be one of
-collect env.name=foo                               env.name must be one of reacher, cube_move, shelf_place, pick_place,
+collect env.name=foo                               env.name must be one of reacher, cube_move, cube_lift, shelf_place,
 collect env.name=null                              env.name must be a text, got None
 collect env.options=null                           env.options must be a mapping of names, got None
 collect env.options=3                              env.options must be a mapping of names, got 3
@@ -252,7 +252,7 @@ class TestGroups:
         """In a process of its own: other tests fill Hydra's store."""
         script = str(EXAMPLES / "collect.py")
         done = subprocess.run([sys.executable, script, "env=null"], capture_output=True, text=True, check=False)
-        names = "cube_move, pick_place, reacher, shelf_place"
+        names = "cube_lift, cube_move, pick_place, reacher, shelf_place"
         assert done.stderr.splitlines()[-1] == f"SettingsError: env must be one of {names}, got null"
         assert "Traceback" not in done.stderr
 

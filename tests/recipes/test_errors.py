@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -78,8 +79,10 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """What commands are given."""
     folder, task = tmp_path_factory.mktemp("files"), reacher_task()
     (folder / "results.json").write_text("{}")
+    marked = replace(task, workspace=replace(task.workspace, landmarks=((0.1, 0.0), (0.0, 0.1))))
     return SimpleNamespace(
         data=random_dataset(folder / "data", task, episodes=2).path,
+        marked=random_dataset(folder / "marked", marked, episodes=1).path,
         small=random_dataset(folder / "small", reacher_task(image_size=32), episodes=1).path,
         agent=save_agent(build_agent("dreamer_pcp", task, "debug"), folder / "agent.zip"),
         other=save_agent(build_agent("dreamer_pcp", reacher_task(image_size=32), "debug"), folder / "other.zip"),
@@ -130,8 +133,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         ),
         (
             "train_offline",
-            "dataset={data} training.eval_interval=1 training.eval_episodes=11",
-            "SettingsError: eval_episodes=11, but reacher has 0 landmark goals",
+            "dataset={marked} training.eval_interval=1 training.eval_episodes=11",
+            "SettingsError: eval_episodes=11, but reacher has 2 landmark goals",
         ),
         ("train_offline", "dataset={data} size.learning.slice_len=99", "DatasetError: {data}: cannot cut sequences of"),
         ("train_offline", "dataset={data} output={results}", "CheckpointError: {results}: cannot write here (File exi"),

@@ -295,6 +295,20 @@ def test_evaluations_while_training(train: Callable[..., str], episodes: list[di
     assert set(goals) <= set(POINTS)
 
 
+def test_without_landmarks_it_trains_and_says_once_that_there_is_nothing_to_score(
+    command: Callable[..., str], dataset: EpisodeDataset, recwarn: pytest.WarningsRecorder
+) -> None:
+    short = ("training.updates=2", "training.video_interval=0", "size=debug", f"dataset={dataset.path}", "output=run")
+    assert "checkpoint: run/checkpoint.zip" in command("train_offline", *short, "training.eval_interval=1")
+    [told] = [str(one.message) for one in recwarn if "evaluations" in str(one.message)]
+    assert told.startswith(
+        "no evaluations during training: the workspace of 'reacher' has no landmark goals; ocwm eval"
+    )
+    recwarn.clear()
+    command("train_offline", *short, "training.eval_interval=0", "training.updates=3")
+    assert not [one for one in recwarn if "evaluations" in str(one.message)]
+
+
 @shows("Training.eval_beside")
 @pytest.mark.parametrize("beside", ["true", "false"])
 @pytest.mark.parametrize("script", ["train_offline", "train_online"])

@@ -35,6 +35,7 @@ from torchrl_ocwm.lazy import lazily
 
 if TYPE_CHECKING:
     from torchrl_ocwm.envs.camera import Camera, Frame
+    from torchrl_ocwm.envs.cube_lift import CubeLift
     from torchrl_ocwm.envs.cube_move import CubeMove
     from torchrl_ocwm.envs.goal_conditioned import GoalConditioned
     from torchrl_ocwm.envs.meta_world import PickPlace, ShelfPlace
@@ -48,6 +49,7 @@ __all__ = [
     "CalibrationError",
     "Camera",
     "ColourMasks",
+    "CubeLift",
     "CubeMove",
     "EnvChoice",
     "EnvOptions",
@@ -86,6 +88,7 @@ __getattr__ = lazily(
     __name__,
     {
         "Camera": "camera",
+        "CubeLift": "cube_lift",
         "CubeMove": "cube_move",
         "Frame": "camera",
         "GoalConditioned": "goal_conditioned",

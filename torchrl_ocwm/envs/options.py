@@ -40,7 +40,7 @@ class EnvOptions(Settings):
 
 @dataclass(frozen=True)
 class CubeMoveOptions(EnvOptions):
-    """Options of Cube move.
+    """Options of Cube move and Cube lift.
 
     Args:
         objects: What is on the table: ``[cube]`` or ``[cube, distractor]``.

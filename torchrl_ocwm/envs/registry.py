@@ -284,6 +284,7 @@ def _make_one(environment: Environment, *, device: torch.device | str | None, **
 _OURS = {
     "reacher": ("reacher:Reacher", EnvOptions, "dm_control"),
     "cube_move": ("cube_move:CubeMove", CubeMoveOptions, "robosuite"),
+    "cube_lift": ("cube_lift:CubeLift", CubeMoveOptions, "robosuite"),
     "shelf_place": ("meta_world:ShelfPlace", MetaWorldOptions, "metaworld"),
     "pick_place": ("meta_world:PickPlace", MetaWorldOptions, "metaworld"),
 }

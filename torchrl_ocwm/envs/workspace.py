@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchrl_ocwm.settings import Settings, SettingsError
 
+_GOLDEN = (5**0.5 - 1) / 2
+
 
 @dataclass(frozen=True)
 class Workspace(Settings):
@@ -46,6 +48,8 @@ class Workspace(Settings):
             raise SettingsError(f"low must be below high on every axis, got {self.low} and {self.high}")
         if self.reach is not None and not 0 <= self.reach[0] < self.reach[1]:
             raise SettingsError(f"reach must be a smaller and a larger distance, got {self.reach}")
+        if self.reach is not None and len(self.low) != 2:
+            raise SettingsError(f"reach is the ring of a planar arm: it needs two axes, low has {len(self.low)}")
         if odd := [point for point in self.landmarks if len(point) != len(self.low)]:
             raise SettingsError(f"landmarks must have {len(self.low)} coordinates, got {odd[0]}")
 
@@ -83,23 +87,35 @@ class Workspace(Settings):
         return low + (high - low) * torch.rand(*shape, self.dim, generator=generator)
 
     def grid(self, size: int) -> Tensor:
-        """``[size, size, dim]`` goals that cover what can be reached, as equal cells, at the cell centres (metres)."""
-        return self._lay_out((torch.arange(size) + 0.5) / size)
+        """``[size, size, dim]`` goals that cover what can be reached, at the centres of equal cells (metres).
 
-    def grid_edges(self, size: int) -> Tensor:
-        """``[size + 1, size + 1, dim]`` corners of the cells of :meth:`grid`, to draw heatmaps."""
-        return self._lay_out(torch.arange(size + 1) / size)
+        Two axes have a square grid. With three, each cell of it has a height, so that the goals are a whole square grid
+        seen along any axis (a Latin square), and scattered in between. One axis has a line of ``size * size`` goals.
+        """
+        cells = size**2 if self.dim == 1 else size
+        return self._lay_out(2 * (self.grid_cells(size) + 0.5) / cells - 1)
 
-    def _lay_out(self, fraction: Tensor) -> Tensor:
-        square = torch.stack(torch.meshgrid(2 * fraction - 1, 2 * fraction - 1, indexing="xy"), -1)
+    def grid_cells(self, size: int) -> Tensor:
+        """``[size, size, dim]`` which cell each goal of :meth:`grid` lies in, counted from 0 on each axis."""
+        if self.dim == 1:
+            return torch.arange(size**2).reshape(size, size, 1)
+        row, column = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
+        scattered = (torch.arange(size, dtype=torch.float64) * _GOLDEN % 1).argsort()
+        others = (scattered[(column + axis * scattered[row]) % size] for axis in range(1, self.dim - 1))
+        return torch.stack([column, row, *others], -1)
+
+    def grid_edges(self, size: int, axes: tuple[int, int] = (0, 1)) -> Tensor:
+        """``[size + 1, size + 1, 2]`` corners of the cells of :meth:`grid`, seen along all but two axes (metres)."""
+        corner = 2 * torch.arange(size + 1) / size - 1
+        low, high = (tuple(end[axis] for axis in axes) for end in (self.low, self.high))
+        return Workspace(low, high, self.reach)._lay_out(torch.stack(torch.meshgrid(corner, corner, indexing="xy"), -1))
+
+    def _lay_out(self, square: Tensor) -> Tensor:
+        """Places ``[..., dim]`` in the box or on the ring, for places in ``[-1, 1]``."""
         if self.reach is not None:
             return _square_to_ring(square, *self.reach)
         low, high = torch.tensor(self.low), torch.tensor(self.high)
-        # The first and the last axis span the grid; an axis between them (a depth) stays in the middle.
-        position = ((low + high) / 2).repeat(*square.shape[:-1], 1)
-        axes = [0, self.dim - 1]
-        position[..., axes] = low[axes] + (high - low)[axes] * (square + 1) / 2
-        return position
+        return low + (high - low) * (square + 1) / 2
 
 
 def _square_to_ring(square: Tensor, inner: float, outer: float) -> Tensor:

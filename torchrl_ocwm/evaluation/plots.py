@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import warnings
+from itertools import combinations, product
 from pathlib import Path
 from textwrap import fill
 
 import matplotlib
 import numpy as np
+import torch
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -20,7 +23,9 @@ from matplotlib import pyplot as plt
 
 
 def heatmap(path: str | Path, scores: dict[str, Tensor], workspace: Workspace, *, title: str = "") -> None:
-    """Draw the score of each goal of the evaluation grid where it lies, one panel per agent.
+    """Draw the score of each goal of the evaluation grid where it lies.
+
+    One panel per agent; with three axes three of them, seen along each axis.
 
     Args:
         path: PNG file to write.
@@ -28,19 +33,44 @@ def heatmap(path: str | Path, scores: dict[str, Tensor], workspace: Workspace, *
         workspace: The workspace that the grid covers.
         title: Written above.
     """
-    figure, axes = _panels(len(scores), columns=5, width=3.2, height=3.4)
-    for axis, (name, values) in zip(axes, scores.items(), strict=True):
-        size = round(len(values) ** 0.5)
-        edges = 100 * workspace.grid_edges(size)
-        x, y = edges[..., 0].numpy(), edges[..., -1].numpy()
-        mesh = axis.pcolormesh(x, y, values.reshape(size, size).numpy(), vmin=0, vmax=1, cmap="viridis")
+    views: list[tuple[int, int] | None] = [*combinations(range(workspace.dim), 2)] or [None]
+    columns = len(views) if len(views) > 1 else 5
+    figure, axes = _panels(len(scores) * len(views), columns=columns, width=3.2, height=3.4)
+    for axis, ((name, values), view) in zip(axes, product(scores.items(), views), strict=True):
+        drawn = _draw_strip(axis, values, workspace) if view is None else _draw_scores(axis, values, workspace, view)
         axis.set_title(fill(f"{name}: {values.nanmean():.2f}", 28))
-        axis.set_aspect("equal")
-        axis.set_xlabel("cm")
-    figure.colorbar(mesh, ax=axes, label="score", shrink=0.8)
+    figure.colorbar(drawn, ax=axes, label="score", shrink=0.8)
     if title:
         figure.suptitle(title)
     save_figure(figure, path)
+
+
+def _draw_scores(axis: Axes, scores: Tensor, workspace: Workspace, view: tuple[int, int]) -> QuadMesh:
+    """The mean score of the goals in each cell, seen along all axes but these two."""
+    if workspace.dim > 2:
+        axis.set_ylabel(f"{_axis_name(workspace, view[1])}, cm")
+    axis.set_xlabel(f"{_axis_name(workspace, view[0])}, cm" if workspace.dim > 2 else "cm")
+    axis.set_aspect("equal")
+    size = round(len(scores) ** 0.5)
+    column, row = workspace.grid_cells(size).flatten(0, 1)[:, view].unbind(-1)
+    total, count = (
+        torch.zeros(size, size).index_put((row, column), values.float(), accumulate=True)
+        for values in (scores, torch.ones_like(scores))
+    )
+    x, y = (100 * workspace.grid_edges(size, view)).unbind(-1)
+    return axis.pcolormesh(x.numpy(), y.numpy(), (total / count).numpy(), vmin=0, vmax=1, cmap="viridis")
+
+
+def _draw_strip(axis: Axes, scores: Tensor, workspace: Workspace) -> QuadMesh:
+    """The score of each goal on a line."""
+    axis.set_xlabel("cm")
+    axis.set_yticks([])
+    ends = np.linspace(100 * workspace.low[0], 100 * workspace.high[0], len(scores) + 1)
+    return axis.pcolormesh(ends, [0, 1], scores.unsqueeze(0).numpy(), vmin=0, vmax=1, cmap="viridis")
+
+
+def _axis_name(workspace: Workspace, axis: int) -> str:
+    return "xyz"[axis] if workspace.dim == 3 else f"axis {axis + 1}"
 
 
 def learning_curves(path: str | Path, runs: dict[str, list[Path]], metrics: dict[str, str]) -> bool:

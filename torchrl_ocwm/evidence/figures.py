@@ -228,6 +228,13 @@ SETUPS = {
         episode_steps=100,
         updates=5.0,
     ),
+    "cube_lift": Setup(
+        policies={"scripted": 0.75, "random": 0.25},
+        options={"horizon": 100},
+        small={"image_size": 32, "mask_scale": 5},
+        episode_steps=100,
+        updates=5.0,
+    ),
     "shelf_place": Setup(
         policies={"scripted": 0.75, "random": 0.25}, options={"horizon": 150}, episode_steps=150, updates=5.0
     ),

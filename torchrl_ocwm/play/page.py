@@ -24,8 +24,9 @@ _AXES = "xyz"
 _NOTICE = 8  # seconds
 _LEGEND = """\
 **Click** into the large picture to set the goal, the red cross, inside the dashed line. **Drag** an object to move it.
-The sliders and buttons do the same. The blue ring is where the world model believes the object to be, the brown one
-where it is in what the agent imagined."""
+Where positions have a height, both keep it. The sliders and buttons do the same, and the slider z moves the goal up and
+down. The blue ring is where the world model believes the object to be, the brown one where it is in what the agent
+imagined."""
 
 
 class Page:
@@ -167,14 +168,20 @@ class Page:
         return "Pause" if self.running else "Go on"
 
     def click(self, as_image: bool, event: gr.EventData) -> list[Any]:
-        """Set the goal to where somebody clicked."""
-        return self.steer(lambda session: session.set_goal(session.places.position(event.to), as_image=as_image))
+        """Set the goal to where somebody clicked, as high as it was."""
+
+        def set_goal(session: Session) -> None:
+            session.set_goal(session.places.position(event.to, session.env.goal_position), as_image=as_image)
+
+        return self.steer(set_goal)
 
     def drag(self, event: gr.EventData) -> list[Any]:
-        """Move the object that is nearest to where a drag began to where it ended."""
+        """Move the object that is nearest to where a drag began to where it ended, as high as it was."""
 
         def move(session: Session) -> None:
-            session.move_object(session.places.position(event.to), session.places.nearest_object(event.begin))
+            name = session.places.nearest_object(event.begin)
+            before = session.env.true_position()[list(session.env.objects).index(name)]
+            session.move_object(session.places.position(event.to, before), name)
 
         return self.steer(move)
 
@@ -221,7 +228,7 @@ class Page:
     def all(self) -> list[Any]:
         """Pictures, numbers and what there is to choose from."""
         player, behaviours = self.stage.player, self.stage.player.behaviours()
-        pictures = self.stage.do(Session.goal_pictures) if self.stage.do(lambda session: session.takes_images) else []
+        takes_images = self.stage.do(lambda session: session.takes_images)
         return [
             *self.frame(),
             *self.stage.do(_sliders),
@@ -229,8 +236,8 @@ class Page:
             player.environment,
             gr.Dropdown(self._agents(), value=player.name),
             gr.Dropdown(behaviours, value=self.stage.behaviour or behaviours[0][1]),
-            gr.Accordion(visible=bool(pictures)),
-            gr.Gallery(pictures),
+            gr.Accordion(visible=takes_images),
+            gr.Gallery(self.stage.do(Session.goal_pictures) if takes_images else []),
         ]
 
 

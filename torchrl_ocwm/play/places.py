@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from torchrl_ocwm.envs import PositioningEnv
@@ -34,15 +36,19 @@ class Places:
         column, row = self.env.project(position) / self.env.image_size
         return float(column), float(row)
 
-    def position(self, point: Point) -> np.ndarray:
+    def position(self, point: Point, level: Sequence[float] | np.ndarray = ()) -> np.ndarray:
         """The position (D,) in the workspace, metres, at a place in the picture. Beside its edge the edge is meant.
+
+        Args:
+            point: The place.
+            level: A position as high as the one that is meant, where positions have a height; none: that of the start.
 
         Raises:
             PlayError: for a place far from the workspace.
         """
         low, high = np.array(self.env.workspace.low), np.array(self.env.workspace.high)
         try:
-            position = self.env.unproject(self.env.image_size * np.asarray(point))
+            position = self.env.unproject(self.env.image_size * np.asarray(point), *level[2:])
         except ValueError as error:
             raise PlayError(str(error)) from error
         inside = position.clip(low, high)
@@ -50,13 +56,11 @@ class Places:
             raise PlayError(f"{_in_cm(position)} is outside the workspace, from {_in_cm(low)} to {_in_cm(high)}")
         return inside
 
-    def corners(self) -> list[Point]:
-        """The corners of the workspace, or of its lowest rectangle, one after the other around it."""
-        low, high = self.env.workspace.low, self.env.workspace.high
-        sides = zip(low[:2], high[:2], strict=True)
-        (left, right), (near, far) = sides
+    def corners(self, level: Sequence[float] | np.ndarray) -> list[Point]:
+        """The corners of the workspace, one after the other around it; where it has a height, as high as a position."""
+        (left, near), (right, far) = self.env.workspace.low[:2], self.env.workspace.high[:2]
         around = [(left, near), (right, near), (right, far), (left, far)]
-        return [self.point(np.array([*corner, *low[2:]])) for corner in around]
+        return [self.point(np.array([*corner, *level[2:]])) for corner in around]
 
     def nearest_object(self, point: Point) -> str:
         """The object that is nearest to a place in the picture."""

@@ -31,7 +31,7 @@ class View(NamedTuple):
         imagined: What the agent imagined, when it got this goal, that it would see now, ``[H, W, 3]`` uint8; ``None``
             for an agent without a world model.
         masks: Where the world model sees each object, ``[O, H, W]`` in [0, 1]; ``None`` for one without objects.
-        workspace: Corners of the workspace.
+        workspace: Corners of the workspace; where goals have a height, on the level of the goal.
         goal: The goal; ``None`` for an image of somebody else's, whose place is not known.
         believed: Where the world model believes the object to be, from all it has seen; ``None`` if it does not say.
         expected: Where it is in what was imagined; ``None`` likewise.
@@ -230,7 +230,7 @@ class Session:
             seen=self._seen["pixels"].transpose(1, 2, 0),
             imagined=decoded_pixels(model, self._imagined),
             masks=decoded_masks(model, latent),
-            workspace=self.places.corners(),
+            workspace=self.places.corners(self.env.goal_position),
             goal=None if self.goal is None else self.places.point(self.goal),
             believed=self._decoded_point(latent),
             expected=self._decoded_point(self._imagined),
