@@ -1,0 +1,59 @@
+"""A transposed convolution with few output channels, as a plain one: it fills the vectors of a processor better."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import conv2d, pad
+
+#: Two neighbours as one number: moved around at once.
+_PAIR = {torch.float64: torch.complex128, torch.float32: torch.float64}
+_PAIR |= dict.fromkeys((torch.bfloat16, torch.float16), torch.float32)
+
+
+def upsample(image: Tensor, layer: nn.ConvTranspose2d, shift: float = 0.0) -> Tensor:
+    """What a transposed convolution that doubles an image makes of it.
+
+    Each pixel becomes 2 x 2 of them. A convolution of stride 1 gives these as channels, of which there are four times
+    as many; then they are put in their places.
+
+    Args:
+        image: ``[N, I, H, W]``.
+        layer: With a kernel of 5 x 5, stride 2, padding 2 and output padding 1.
+        shift: Added to its bias.
+
+    Returns:
+        ``[N, O, 2H, 2W]``.
+
+    Examples:
+        >>> layer, image = nn.ConvTranspose2d(3, 2, 5, 2, 2, 1), torch.rand(4, 3, 6, 5)
+        >>> torch.allclose(upsample(image, layer, 0.5), layer(image) + 0.5, atol=1e-6)
+        True
+    """
+    into, out = layer.weight.shape[:2]
+    # Row 2m + s of the result is made of rows m - 1, m and m + 1 by the rows 4 + s, 2 + s and s of the kernel.
+    rows = pad(layer.weight, (0, 1, 0, 1)).view(into, out, 3, 2, 3, 2).flip(2, 4)
+    kernel = rows.permute(1, 3, 5, 0, 2, 4).reshape(4 * out, into, 3, 3)
+    bias = None if layer.bias is None else (layer.bias + shift).repeat_interleave(4)
+    parts = conv2d(image, kernel, bias, padding=1)
+    return _Interleave.apply(parts.movedim(1, -1).unflatten(-1, (out, 2, 2)))
+
+
+class _Interleave(torch.autograd.Function):
+    """``[N, H, W, O, 2, 2]``, channels, rows and columns of what each pixel becomes, to ``[N, O, 2H, 2W]``."""
+
+    @staticmethod
+    def forward(ctx: Any, parts: Tensor) -> Tensor:
+        pairs = parts.contiguous().view(_PAIR[parts.dtype]).squeeze(-1)
+        return pairs.permute(0, 3, 1, 4, 2).contiguous().view(parts.dtype).flatten(2, 3)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        count, out, height, width = gradient.shape
+        pairs = gradient.contiguous().view(_PAIR[gradient.dtype]).view(count, out, height // 2, 2, width // 2)
+        rows = pairs.transpose(1, 2).flatten(2, 3)  # in two turns, which is faster than one
+        return rows.transpose(2, 3).contiguous().view(gradient.dtype).unflatten(-1, (out, 2, 2))
