@@ -14,7 +14,7 @@ def keep_freed_memory() -> bool:
     """Let this process keep the memory of freed tensors, up to 1 GiB, for those that follow.
 
     An update allocates the same images again and again. By default the C library returns them to the system, which
-    clears every page before it hands it out again: a sixth of an update at size ``cpu``. Tensors of more than 64 MiB
+    clears every page before it hands it out again: a sixth of an update at size ``cpu``. Tensors of more than 32 MiB
     are still returned at once.
 
     Returns:
@@ -23,4 +23,4 @@ def keep_freed_memory() -> bool:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is None:
         return False
-    return bool(mallopt(_MMAP_THRESHOLD, 64 * _MIB) and mallopt(_TRIM_THRESHOLD, 1024 * _MIB))
+    return bool(mallopt(_MMAP_THRESHOLD, 32 * _MIB) and mallopt(_TRIM_THRESHOLD, 1024 * _MIB))
