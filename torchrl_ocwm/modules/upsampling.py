@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d, pad
 
-#: Two neighbours as one number: moved around at once.
+# Two neighbours as one number, to move them at once.
 _PAIR = {torch.float64: torch.complex128, torch.float32: torch.float64}
 _PAIR |= dict.fromkeys((torch.bfloat16, torch.float16), torch.float32)
 
@@ -37,17 +37,16 @@ def upsample(image: Tensor, layer: nn.ConvTranspose2d, shift: float = 0.0) -> Te
     # Row 2m + s of the result is made of rows m - 1, m and m + 1 by the rows 4 + s, 2 + s and s of the kernel.
     rows = pad(layer.weight, (0, 1, 0, 1)).view(into, out, 3, 2, 3, 2).flip(2, 4)
     kernel = rows.permute(1, 3, 5, 0, 2, 4).reshape(4 * out, into, 3, 3)
-    bias = None if layer.bias is None else (layer.bias + shift).repeat_interleave(4)
-    parts = conv2d(image, kernel, bias, padding=1)
-    return _Interleave.apply(parts.movedim(1, -1).unflatten(-1, (out, 2, 2)))
+    assert layer.bias is not None
+    return _Interleave.apply(conv2d(image, kernel, (layer.bias + shift).repeat_interleave(4), padding=1))
 
 
 class _Interleave(torch.autograd.Function):
-    """``[N, H, W, O, 2, 2]``, channels, rows and columns of what each pixel becomes, to ``[N, O, 2H, 2W]``."""
+    """``[N, O * 4, H, W]``, channels, rows and columns of what each pixel becomes, to ``[N, O, 2H, 2W]``."""
 
     @staticmethod
     def forward(ctx: Any, parts: Tensor) -> Tensor:
-        pairs = parts.contiguous().view(_PAIR[parts.dtype]).squeeze(-1)
+        pairs = parts.movedim(1, -1).contiguous().view(_PAIR[parts.dtype]).unflatten(-1, (-1, 2))
         return pairs.permute(0, 3, 1, 4, 2).contiguous().view(parts.dtype).flatten(2, 3)
 
     @staticmethod
@@ -56,4 +55,4 @@ class _Interleave(torch.autograd.Function):
         count, out, height, width = gradient.shape
         pairs = gradient.contiguous().view(_PAIR[gradient.dtype]).view(count, out, height // 2, 2, width // 2)
         rows = pairs.transpose(1, 2).flatten(2, 3)  # in two turns, which is faster than one
-        return rows.transpose(2, 3).contiguous().view(gradient.dtype).unflatten(-1, (out, 2, 2))
+        return rows.transpose(2, 3).contiguous().view(gradient.dtype).movedim(-1, 1)
