@@ -45,13 +45,13 @@ class _Interleave(torch.autograd.Function):
     """``[N, O * 4, H, W]``, channels, rows and columns of what each pixel becomes, to ``[N, O, 2H, 2W]``."""
 
     @staticmethod
-    def forward(ctx: Any, parts: Tensor) -> Tensor:
+    def forward(ctx: Any, parts: Tensor) -> Tensor:  # noqa: ARG004
         pairs = parts.movedim(1, -1).contiguous().view(_PAIR[parts.dtype]).unflatten(-1, (-1, 2))
         return pairs.permute(0, 3, 1, 4, 2).contiguous().view(parts.dtype).flatten(2, 3)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # noqa: ARG004
         count, out, height, width = gradient.shape
         pairs = gradient.contiguous().view(_PAIR[gradient.dtype]).view(count, out, height // 2, 2, width // 2)
         rows = pairs.transpose(1, 2).flatten(2, 3)  # in two turns, which is faster than one
