@@ -94,6 +94,17 @@ def test_work_is_that_of_products_and_convolutions_in_both_passes(update_speed: 
     assert (none.flop, none.operations) == (0, 2)
 
 
+def test_profile_of_updates_has_shares_of_each_kind() -> None:
+    profile = benchmark("update_profile")
+    assert profile.kind("aten::convolution_backward", [[2, 3], []]) == "convolutions"
+    assert profile.kind("aten::addmm", [[5], [2**20, 5]]) == "products"
+    assert profile.kind("aten::mul", [[2**10, 2**8], [2**8]]) == "other, large tensors"
+    assert profile.kind("aten::mul", [[2**10, 2**7], []]) == "other, small tensors"
+    shares = profile.shares("dreamer", "debug", 1)
+    assert min(shares[0], shares[1], shares[3]) > 0.01  # images of this size are small
+    assert sum(shares) == pytest.approx(1)
+
+
 def test_speed_of_updates_beside_another_commit(
     update_speed: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,6 +16,7 @@ from torchrl_ocwm.modules import (
     ObjectDecoder,
     ObjectLatentExtractor,
 )
+from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.objects import compose
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import STYLES
@@ -53,6 +54,16 @@ def test_decoder_takes_each_latent_alone(style: Any) -> None:
             alone_colours, alone_logits = decoder(latents[i : i + 1, instance : instance + 1])
             torch.testing.assert_close(colours[i, instance], alone_colours[0, 0], rtol=1e-4, atol=1e-5)
             torch.testing.assert_close(logits[i, instance], alone_logits[0, 0], rtol=1e-4, atol=1e-5)
+
+
+def test_many_images_are_decoded_some_at_a_time() -> None:
+    decoder = ObjectDecoder(8, 16, Architecture(cnn_depth=2, cnn_mults=(1, 2)))
+    latents, sizes = torch.randn(100, 3, 8), []
+    expected = decoder.cnn(latents)
+    decoder.cnn.register_forward_hook(lambda module, inputs, images: sizes.append(len(images)))
+    colours, logits = decoder(latents)
+    assert sizes == [256, 44]
+    torch.testing.assert_close(torch.cat([colours, logits.unsqueeze(-3)], -3), expected)
 
 
 def test_compose_pixel_by_pixel() -> None:

@@ -62,5 +62,11 @@ def test_decoder_is_that_of_torchrl() -> None:
     plain = DreamerV3ImageDecoder(5, (3, 8, 8), 4, (1, 2), num_blocks=1)
     ours = fast_norms(ImageDecoder(5, (3, 8, 8), 4, (1, 2), num_blocks=1))
     ours.load_state_dict(plain.state_dict())
-    latent = torch.randn(2, 3, 4), torch.randn(2, 3, 1)
-    torch.testing.assert_close(ours(*latent), plain(*latent))
+    latent, gradient = (torch.randn(2, 3, 4), torch.randn(2, 3, 1)), torch.randn(2, 3, 3, 8, 8)
+    expected, got = plain(*latent), ours(*latent)
+    torch.testing.assert_close(got, expected)
+    got.backward(gradient)
+    expected.backward(gradient)
+    of_ours = dict(ours.named_parameters())
+    for name, parameter in plain.named_parameters():
+        torch.testing.assert_close(of_ours[name].grad, parameter.grad, rtol=1e-4, atol=1e-4, msg=name)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import conv_transpose2d
 from torchrl.modules import (
     MLP,
     DreamerV3ImageDecoder,
@@ -23,6 +22,7 @@ from torchrl_ocwm.modules.architecture import Architecture, Style
 from torchrl_ocwm.modules.dtypes import unit_image
 from torchrl_ocwm.modules.recurrence import BlockGRU, Posterior, Prior
 from torchrl_ocwm.modules.rms_norm import fast_norms
+from torchrl_ocwm.modules.upsampling import upsample
 from torchrl_ocwm.settings import SettingsError, read
 
 UNIMIX = 0.01
@@ -152,8 +152,7 @@ class ImageDecoder(DreamerV3ImageDecoder):
         latent = torch.cat(inputs, -1)
         hidden = self.projection(latent.flatten(0, -2)).unflatten(-1, self.initial_shape)
         hidden = self.layers[:-1](self.projection_norm(hidden))  # with its SiLU
-        last = self.layers[-1]
-        image = conv_transpose2d(hidden, last.weight, last.bias + 0.5, last.stride, last.padding, last.output_padding)
+        image = upsample(hidden, self.layers[-1], shift=0.5)
         # The encoder's stages begin at the first pixel too, so that a pixel is decoded from where it was encoded.
         return image[..., : self.size[0], : self.size[1]].unflatten(0, latent.shape[:-1])
 

@@ -9,6 +9,8 @@ from torchrl_ocwm.images import ImageSize
 from torchrl_ocwm.modules.architecture import Architecture, Style
 from torchrl_ocwm.modules.networks import make_image_decoder, make_mlp
 
+_AT_ONCE = 256  # images that a CPU decodes; fewer save no more memory
+
 
 class ObjectLatentExtractor(nn.Module):
     """Object latents from the latent state of the scene, p(s_obj | s, c_obj) (FOCUS; paper, equation 2).
@@ -83,8 +85,16 @@ class ObjectDecoder(nn.Module):
 
     def forward(self, object_latent: Tensor) -> tuple[Tensor, Tensor]:
         """Colours ``[..., N, 3, H, W]`` and mask logits ``[..., N, H, W]``."""
-        colours, mask_logits = self.cnn(object_latent).split([3, 1], -3)
+        colours, mask_logits = self._decode(object_latent).split([3, 1], -3)
         return colours, mask_logits.squeeze(-3)
+
+    def _decode(self, object_latent: Tensor) -> Tensor:
+        """``[..., N, 4, H, W]``. A CPU decodes many images some at a time: with their gradients they take memory."""
+        latents = object_latent.flatten(0, -2)
+        if latents.device.type != "cpu" or len(latents) <= _AT_ONCE:
+            return self.cnn(object_latent)
+        images = torch.cat([self.cnn(some) for some in latents.split(_AT_ONCE)])
+        return images.unflatten(0, object_latent.shape[:-1])
 
 
 def compose(colours: Tensor, mask_logits: Tensor) -> Tensor:

@@ -105,8 +105,8 @@ def _scale(x: Tensor, eps: Tensor) -> Tensor:
 
 def _gradients(gradient: Tensor, unit: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """From the gradient of y = u w with u = x r: w · g u ``[..., 1]``, and that of w ``[C]``."""
-    product = gradient * unit
-    return (product @ weight).unsqueeze(-1), product.flatten(0, -2).sum(0)
+    rows = (gradient * unit).flatten(0, -2)
+    return (rows @ weight).view(*unit.shape[:-1], 1), rows.sum(0)
 
 
 def fast_norms(module: Module) -> Module:

@@ -11,8 +11,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
-from torchrl_ocwm.modules.dtypes import flags, unit_image
-from torchrl_ocwm.objectives.world_model import Term, WeightedModelLoss
+from torchrl_ocwm.modules.dtypes import flags
+from torchrl_ocwm.objectives.world_model import Term, WeightedModelLoss, image_reconstruction
 from torchrl_ocwm.settings import read
 
 LatentDistance = Literal["cosine", "mse"]
@@ -75,7 +75,7 @@ def object_reconstruction(colours: Tensor, pixels: Tensor, masks: Tensor) -> Ten
     *objects, predicted = colours.float().unbind(-4)
     for colour, mask in zip(objects, instance_masks(masks).unbind(-3), strict=False):
         predicted = torch.where(mask.unsqueeze(-3), colour, predicted)
-    return (predicted - unit_image(pixels)).square().sum((-3, -2, -1)).mean()
+    return image_reconstruction(predicted, pixels)
 
 
 def positional_latent_loss(

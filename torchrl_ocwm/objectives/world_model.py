@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, cat
-from torch.nn.functional import binary_cross_entropy_with_logits, cosine_similarity
+from torch.nn.functional import binary_cross_entropy_with_logits, cosine_similarity, mse_loss
 from torchrl.objectives import DreamerV3ModelLoss, categorical_kl_terms, symlog, two_hot_cross_entropy
 
 from torchrl_ocwm.modules.dtypes import flags, unit_image
@@ -28,7 +28,8 @@ def image_reconstruction(prediction: Tensor, target: Tensor) -> Tensor:
         >>> image_reconstruction(torch.ones(2, 1, 2, 2), torch.zeros(2, 1, 2, 2, dtype=torch.uint8))
         tensor(4.)
     """
-    return (prediction.float() - unit_image(target)).square().flatten(-3).sum(-1).mean()
+    images = prediction.shape[:-3].numel()
+    return mse_loss(prediction.float(), unit_image(target), reduction="sum") / images
 
 
 def symlog_reconstruction(prediction: Tensor, target: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.objectives import GoalConditionedDreamerLoss
+from torchrl_ocwm.training.allocator import keep_freed_memory
 from torchrl_ocwm.training.settings import Training
 
 
@@ -103,7 +104,9 @@ class SlowCritics:
 
 
 def make_stepper(agent: Agent, training: Training) -> DreamerV3OptimizationStepper:
-    """A stepper: forward, backward, optimiser and slow critic."""
+    """A stepper: forward, backward, optimiser and slow critic. On a CPU the process keeps the memory that they free."""
+    if torch.device(training.device).type == "cpu":
+        keep_freed_memory()
     return Stepper(
         agent.loss,
         agent.size.learning.optimizer.build(agent.parameter_groups()),
