@@ -14,8 +14,8 @@ def keep_freed_memory() -> bool:
     """Let this process keep the memory of freed tensors, up to 1 GiB, for those that follow.
 
     An update allocates the same images again and again. By default the C library returns them to the system, which
-    clears every page before it hands it out again: a sixth of an update at size ``cpu``. Tensors of more than 32 MiB
-    are still returned at once.
+    clears every page before it hands it out again: up to a sixth of an update at size ``cpu``. Tensors of more
+    than 32 MiB are still returned at once.
 
     Returns:
         Whether there is something to set: glibc has it, other C libraries do not.
