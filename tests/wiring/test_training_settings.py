@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -316,10 +317,12 @@ def test_evaluations_beside_training(
     command: Callable[..., str],
     scripts: dict[str, ModuleType],
     monkeypatch: pytest.MonkeyPatch,
-    dataset: EpisodeDataset,
+    tmp_path: Path,
     beside: str,
     script: str,
 ) -> None:
+    task = replace(TASK, workspace=replace(TASK.workspace, landmarks=POINTS))
+    dataset = random_dataset(tmp_path / "data", task)
     seen: list[Any] = []
 
     def note(agent: Agent, **settings: Any) -> nullcontext[None]:
@@ -330,7 +333,7 @@ def test_evaluations_beside_training(
     monkeypatch.setattr(scripts[script], script, lambda *_, **__: Path("run", "checkpoint.zip"))
     if script == "train_online":
         monkeypatch.setattr(scripts[script], "collect_seed_steps", lambda *_, **__: dataset)
-        monkeypatch.setattr(scripts[script], "make_task", lambda *_, **__: TASK)
+        monkeypatch.setattr(scripts[script], "make_task", lambda *_, **__: task)
         monkeypatch.setattr(scripts[script], "with_coverage", lambda *_: None)
     else:
         monkeypatch.setattr(EpisodeDataset, "open", lambda *_, **__: dataset)

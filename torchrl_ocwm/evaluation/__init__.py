@@ -20,7 +20,7 @@ from torchrl_ocwm.evaluation.html import write_html
 from torchrl_ocwm.evaluation.imagined import imagined_distance, imagined_rollout, predicted_return
 from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation, can_play
 from torchrl_ocwm.evaluation.objects import object_errors
-from torchrl_ocwm.evaluation.open_loop import random_sequences
+from torchrl_ocwm.evaluation.open_loop import posterior, random_sequences
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.reconstruction import ReconstructionError
 from torchrl_ocwm.evaluation.report import Report, to_json
@@ -62,6 +62,7 @@ __all__ = [
     "normalized_score",
     "object_errors",
     "picture_objects",
+    "posterior",
     "predicted_return",
     "random_sequences",
     "save_figure",

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchrl_ocwm import load_agent
 from torchrl_ocwm.data import EpisodeDataset
-from torchrl_ocwm.evaluation.open_loop import posterior, random_sequences
+from torchrl_ocwm.evaluation import posterior, random_sequences
 
 EDGES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3)
 

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from torchrl_ocwm import load_agent
 from torchrl_ocwm.data import EpisodeDataset
-from torchrl_ocwm.evaluation.open_loop import posterior, random_sequences
+from torchrl_ocwm.evaluation import posterior, random_sequences
 from torchrl_ocwm.modules import TemporalDistance
 
 STEPS = (0, 1, 2, 4, 8, 15, 25, 40)
