@@ -70,8 +70,8 @@ def test_shows_what_the_world_model_has(dataset: EpisodeDataset, tmp_path: Path,
     goals = {row[0]: row for row in rows if row[0] in numbers["goal_latents"]}
     assert len(goals) == (3 if "goal_latents.png" in pictures else 0)
     for goal, row in goals.items():
-        assert float(row[4]) == pytest.approx(numbers["goal_latents"][goal]["mean_rank"], abs=5e-3)
-        assert 1 <= float(row[4]) <= 10
+        assert float(row[5]) == pytest.approx(numbers["goal_latents"][goal]["mean_rank"], abs=5e-3)
+        assert 1 <= float(row[5]) <= 10
 
 
 def test_errors_are_one_message(dataset: EpisodeDataset, tmp_path: Path) -> None:

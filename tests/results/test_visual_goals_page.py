@@ -48,7 +48,32 @@ def measured() -> list[str]:
     ]
 
 
+def shape_of_rewards() -> list[str]:
+    """Rows and sentences of what the two scripts beside the page printed."""
+    shapes, printed = ((RESULTS / NAME / f"{name}.md").read_text() for name in ("reward_shape", "temporal_distance"))
+    explained, *lines = printed.splitlines()
+    horizon = settings(NAME, "lexa_temporal_seed_0")["size"]["learning"]["imagination_horizon"]
+    updates = settings(NAME, "lexa_temporal_seed_0")["training"]["updates"]
+    rewarded = dict(zip(cells(lines[1]), cells(lines[3]), strict=True))
+    far = float(rewarded["other sequences"])
+    assert far - float(rewarded["15 steps"]) <= 0.1  # "almost"
+    return [
+        *shapes.splitlines()[2:],
+        *lines[1:],
+        f"its horizon of {horizon} steps",
+        f"one imagined rollout, {horizon} steps at most",
+        "Beyond 15 steps it says almost what it says of other sequences",
+        f"The head explains {explained.split()[3]} of the variance of those after {updates:,} updates",
+        f"said to be {rewarded['0 steps']} of the horizon away, and two steps off it is {rewarded['2 steps']}",
+    ]
+
+
+def cells(line: str) -> list[str]:
+    """Those of a row of a table."""
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
 def test_page() -> None:
-    sentences = [*measured(), *protocol(), *STATED]
+    sentences = [*measured(), *protocol(), *shape_of_rewards(), *STATED]
     assert missing(NAME, sentences) == []
     assert unchecked(NAME, sentences) == []
