@@ -14,8 +14,8 @@ class Evaluation(Settings):
 
     Args:
         behaviour: Which of an agent's behaviours acts; ``None``: that which acts unless another is asked for.
-        goals: Goals, laid out as a square grid over the reachable workspace; in three dimensions they are one seen from
-            each side.
+        goals: Goals, laid out as a square grid over the reachable workspace. In three dimensions they look like such a
+            grid from every side.
         episode_steps: Steps per episode.
         image_goals: Also give the goals as images, what would be seen with the object there, to the agents that take
             both. Those that take nothing else get them anyway.

@@ -218,29 +218,21 @@ FIGURES = {
     ),
 }
 
-_BOTH = {"scripted": 0.5, "random": 0.5}
+_BOTH, _MOSTLY_SCRIPTED = {"scripted": 0.5, "random": 0.5}, {"scripted": 0.75, "random": 0.25}
+_CUBE = Setup(
+    policies=_MOSTLY_SCRIPTED,
+    options={"horizon": 100},
+    small={"image_size": 32, "mask_scale": 5},
+    episode_steps=100,
+    updates=5.0,
+)
+_META_WORLD = Setup(policies=_MOSTLY_SCRIPTED, options={"horizon": 150}, episode_steps=150, updates=5.0)
 SETUPS = {
     "reacher": Setup(policies=_BOTH, options={"horizon": 100}, episode_steps=150),
-    "cube_move": Setup(
-        policies={"scripted": 0.75, "random": 0.25},
-        options={"horizon": 100},
-        small={"image_size": 32, "mask_scale": 5},
-        episode_steps=100,
-        updates=5.0,
-    ),
-    "cube_lift": Setup(
-        policies={"scripted": 0.75, "random": 0.25},
-        options={"horizon": 100},
-        small={"image_size": 32, "mask_scale": 5},
-        episode_steps=100,
-        updates=5.0,
-    ),
-    "shelf_place": Setup(
-        policies={"scripted": 0.75, "random": 0.25}, options={"horizon": 150}, episode_steps=150, updates=5.0
-    ),
-    "pick_place": Setup(
-        policies={"scripted": 0.75, "random": 0.25}, options={"horizon": 150}, episode_steps=150, updates=5.0
-    ),
+    "cube_move": _CUBE,
+    "cube_lift": _CUBE,
+    "shelf_place": _META_WORLD,
+    "pick_place": _META_WORLD,
 }
 _TINY = {"image_size": 16, "horizon": 20}
 BUDGETS = {

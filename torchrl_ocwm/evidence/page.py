@@ -90,7 +90,7 @@ def _section(env: str, figure: Figure, done: Sequence[Result], root: Path, folde
     """Table and pictures of one environment."""
     report, place = read_report(done, root), folder / env
     report.save(place)
-    pictures = []
+    pictures, numbers = [], f"Goal by goal: [results.json]({env}/results.json)."
     for kind in figure.draws:
         if kind == "heatmap":
             data = done[0].evaluated.trained.data
@@ -100,6 +100,7 @@ def _section(env: str, figure: Figure, done: Sequence[Result], root: Path, folde
             if not learning_curves(place / "curves.png", _folders(done, root), CURVE):
                 continue
             _save_curves(place / "curves.csv", _folders(done, root))
+            numbers += f" Update by update: [curves.csv]({env}/curves.csv)."
         else:
             metric_lines(place / "lines.png", _lines(figure, done, report), figure.places)
         pictures.append(f"![{kind}]({env}/{kind}.png)")
@@ -107,10 +108,8 @@ def _section(env: str, figure: Figure, done: Sequence[Result], root: Path, folde
     text = (
         f"{len(report.goals)} goals, {steps} steps each; ± is the standard error over seeds. IQM is the mean of the "
         "middle half of all seeds and goals; in brackets its 95% interval, a stratified bootstrap over seeds for each "
-        f"goal. Goal by goal: [results.json]({env}/results.json)."
+        f"goal. {numbers}"
     )
-    if f"![curves]({env}/curves.png)" in pictures:
-        text += f" Update by update: [curves.csv]({env}/curves.csv)."
     return [f"## {env}", report.markdown(intervals=True), text, *pictures]
 
 

@@ -12,7 +12,23 @@ from torchrl_ocwm.settings import read
 Normalization = Literal["none", "scale", "standard"]
 
 
-class StreamingNorm(nn.Module):
+class _Moving(nn.Module):
+    """Counts calls, and says how much the newest counts: as much as each before it, and ``rate`` at least."""
+
+    calls: Tensor
+
+    def __init__(self, rate: float) -> None:
+        super().__init__()
+        self.rate = rate
+        self.register_buffer("calls", torch.zeros(()))
+
+    def _count(self) -> Tensor:
+        """Count a call; its share, a scalar."""
+        self.calls.add_(1)
+        return (1 / self.calls).clamp_min(self.rate)
+
+
+class StreamingNorm(_Moving):
     """Normalise by moments that move along with what is seen.
 
     Each call in training mode first takes its values into the moments: the mean of all calls so far, until these are
@@ -39,21 +55,18 @@ class StreamingNorm(nn.Module):
 
     mean: Tensor
     square: Tensor
-    calls: Tensor
 
     def __init__(self, mode: Normalization = "standard", *, rate: float = 0.01, epsilon: float = 1e-6) -> None:
-        super().__init__()
+        super().__init__(rate)
         read(Normalization, mode, "mode")
-        self.mode, self.rate, self.epsilon = mode, rate, epsilon
+        self.mode, self.epsilon = mode, epsilon
         self.register_buffer("mean", torch.zeros(()))
         self.register_buffer("square", torch.ones(()))
-        self.register_buffer("calls", torch.zeros(()))
 
     @torch.no_grad()
     def update(self, values: Tensor) -> None:
         """Take values ``[...]`` into the moments."""
-        self.calls.add_(1)
-        weight = (1 / self.calls).clamp_min(self.rate)
+        weight = self._count()
         self.mean.lerp_(values.float().mean(), weight)
         self.square.lerp_(values.float().square().mean(), weight)
 
@@ -69,7 +82,7 @@ class StreamingNorm(nn.Module):
         return values
 
 
-class MovingCentre(nn.Module):
+class MovingCentre(_Moving):
     """Subtract the mean vector of what was seen.
 
     Each call in training mode first takes its vectors into the mean: that of all calls so far, until these are
@@ -93,19 +106,15 @@ class MovingCentre(nn.Module):
     """
 
     mean: Tensor
-    calls: Tensor
 
     def __init__(self, features: int, *, rate: float = 0.01) -> None:
-        super().__init__()
-        self.rate = rate
+        super().__init__(rate)
         self.register_buffer("mean", torch.zeros(features))
-        self.register_buffer("calls", torch.zeros(()))
 
     @torch.no_grad()
     def update(self, vectors: Tensor) -> None:
         """Take vectors ``[..., L]`` into the mean."""
-        self.calls.add_(1)
-        self.mean.lerp_(vectors.float().flatten(0, -2).mean(0), (1 / self.calls).clamp_min(self.rate))
+        self.mean.lerp_(vectors.float().flatten(0, -2).mean(0), self._count())
 
     def forward(self, vectors: Tensor) -> Tensor:
         """Vectors ``[..., L]`` without the mean; in training mode they are counted first."""
