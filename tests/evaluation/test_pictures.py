@@ -99,11 +99,22 @@ def test_learning_curves(tmp_path: Path) -> None:
     assert not (tmp_path / "none.png").exists()
 
 
-def test_the_legend_names_each_line_once_beside_the_panels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", ["lines", "curves"])
+def test_the_legend_names_each_line_once_beside_the_panels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr(plots, "save_figure", lambda figure, path: drawn.append(figure))
-    point = {"1": (0.5, None), "2": (0.6, 0.1)}
-    metric_lines(tmp_path / "lines.png", {"score": {"a": point, "b": point}, "error": {"b": point}}, "weight")
+    if kind == "lines":
+        point = {"1": (0.5, None), "2": (0.6, 0.1)}
+        metric_lines(tmp_path / "x.png", {"score": {"a": point, "b": point}, "error": {"b": point}}, "weight")
+    else:
+        for name, metrics in {"a": ["score"], "b": ["score", "error"]}.items():
+            logger = CSVLogger("log", log_dir=str(tmp_path / name))
+            for metric in metrics:
+                logger.log_scalar(metric, 0.5, step=1)
+        runs = {name: [tmp_path / name] for name in "ab"}
+        assert learning_curves(tmp_path / "x.png", runs, {"score": "score", "error": "error"})
     (legend,) = drawn[0].legends
     assert sorted(text.get_text() for text in legend.get_texts()) == ["a", "b"]
     drawn[0].canvas.draw()
