@@ -26,6 +26,9 @@ LONG := \
 	tests/examples/test_benchmarks.py::test_speed_of_an_evaluation_adds_up
 # Other Pythons, of which the machine may have some (`python3.10`, or in pyenv): the package and its recipes, no simulator.
 PYTHONS := 3.10 3.13
+# With CUDA, as the package registry has PyTorch for Linux, an environment takes 5 GB. It goes when its tests have passed.
+# GB that must be free for it:
+PYTHON_SPACE := 10
 NEXT_VERSIONS := torchrl-nightly==2026.10.27 tensordict==0.15.3
 
 export MUJOCO_GL ?= egl
@@ -69,7 +72,9 @@ test-pythons:
 	@$(MAKE) --jobs 1 $(PYTHONS:%=test-python-%)
 
 test-python-%:
-	@for python in python$* $$HOME/.pyenv/versions/$*.*/bin/python; do \
+	@free=$$(df -Pk . | awk 'NR == 2 {print int($$4 / 1048576)}'); [ "$$free" -ge $(PYTHON_SPACE) ] || { \
+		echo "Python $*: $$free GB are free here, its packages need $(PYTHON_SPACE): not tested with it"; exit 0; }; \
+	for python in python$* $$HOME/.pyenv/versions/$*.*/bin/python; do \
 		$$python -c '' 2> /dev/null && exec $(MAKE) FOUND=$$python .venv-$*/.tested; \
 	done; echo "Python $* is not on this machine: not tested with it"
 
@@ -81,6 +86,7 @@ test-python-%:
 .venv-%/.tested: .venv-%/.installed FORCE
 	$(@D)/bin/python -m pytest -q torchrl_ocwm/modules torchrl_ocwm/objectives tests/training/test_own_recordings.py \
 		-k 'not test_recordings_train or simulator'
+	rm -r $(@D)
 
 .SECONDARY:
 
