@@ -206,10 +206,21 @@ def test_a_simulator_without_packages_for_this_python(monkeypatch: pytest.Monkey
 
 
 def test_a_library_of_the_system_that_is_missing() -> None:
-    message = "Cube move needs a library .*libGL.so.1: cannot open.*apt-get install libgl1 .*opencv-python-headless"
+    message = "Cube move cannot be loaded: libGL.so.1: cannot open.*apt-get install libgl1 .*opencv-python-headless"
     with pytest.raises(ImportError, match=message) as caught, needs("Cube move", "robosuite"):
         raise ImportError("libGL.so.1: cannot open shared object file: No such file or directory")
     assert "\n" not in str(caught.value)
+
+
+def test_a_package_of_another_release() -> None:
+    """It says what failed, and nothing of OpenCV."""
+    with (
+        pytest.raises(ImportError, match="cannot import name 'x' from 'mujoco'") as caught,
+        needs("Reacher", "dm-control"),
+    ):
+        raise ImportError("cannot import name 'x' from 'mujoco'")
+    assert "pip install --upgrade 'torchrl-ocwm[dm-control]'" in str(caught.value)
+    assert "libgl1" not in str(caught.value)
 
 
 @pytest.mark.parametrize("module", ["mujoco", "gymnasium"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,10 +10,12 @@ from contextlib import contextmanager
 from torchrl_ocwm.errors import MissingPackageError, UserError
 
 _NOT_FOR_3_13 = ("dm_control", "robosuite")
+_OPENCVS = re.compile(r"libGL\b|libgthread|libglib|cv2")
+_FOR_OPENCV = "`apt-get install libgl1 libglib2.0-0`, or `pip install opencv-python-headless` instead of opencv-python"
 
 
 class SystemLibraryError(UserError, ImportError):
-    """A package cannot be loaded, for want of a library of the system; the message says what installs it."""
+    """A package is there but cannot be loaded; the message says what may help."""
 
 
 def missing(what: str, module: str, extra: str) -> MissingPackageError:
@@ -29,14 +32,13 @@ def needs(what: str, extra: str) -> Iterator[None]:
 
     Raises:
         MissingPackageError: if a package is missing, with the extra to install.
-        SystemLibraryError: if a package lacks a library of the system, with what to install.
+        SystemLibraryError: if a package cannot be loaded, for want of a library of the system or of another package's
+            release.
     """
     try:
         yield
     except ModuleNotFoundError as error:
         raise missing(what, str(error.name), extra) from None
     except ImportError as error:
-        raise SystemLibraryError(
-            f"{what} needs a library of the system that is missing ({error}): for OpenCV, "
-            "`apt-get install libgl1 libglib2.0-0`, or `pip install opencv-python-headless` instead of opencv-python"
-        ) from error
+        remedy = _FOR_OPENCV if _OPENCVS.search(str(error)) else f"pip install --upgrade 'torchrl-ocwm[{extra}]'"
+        raise SystemLibraryError(f"{what} cannot be loaded: {error}. What may help: {remedy}") from error

@@ -20,7 +20,7 @@ class RMSNorm(nn.Module):
         weight: ``[C]``.
         eps: Added to the mean square.
 
-    Called with ``[..., C]``; returns the same shape and dtype. It calculates in float32.
+    Called with ``[..., C]``; returns the same shape and dtype. It calculates in float32 at least.
 
     Examples:
         >>> RMSNorm(nn.Parameter(torch.ones(2)))(torch.tensor([[3.0, 4.0]]))
@@ -61,7 +61,7 @@ class _RMSNorm(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, weight: Tensor, eps: Tensor) -> Tensor:
-        x = value.float()
+        x = _precise(value)
         scale = _scale(x, eps)
         unit = x * scale
         ctx.save_for_backward(unit, scale, weight)
@@ -71,8 +71,9 @@ class _RMSNorm(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         unit, scale, weight = ctx.saved_tensors
-        along, of_weight = _gradients(gradient.float(), unit, weight)
-        of_unit = gradient.float() * weight
+        of_unit = _precise(gradient)
+        along, of_weight = _gradients(of_unit, unit, weight)
+        of_unit = of_unit * weight
         return of_unit.addcmul_(unit, along, value=-1 / len(weight)).mul_(scale).to(gradient.dtype), of_weight, None
 
 
@@ -81,7 +82,7 @@ class _RMSNormSiLU(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, weight: Tensor, eps: Tensor) -> Tensor:
-        x = value.float()
+        x = _precise(value)
         scale = _scale(x, eps)
         ctx.save_for_backward(value, scale, weight)
         return silu((x * scale).mul_(weight), inplace=True).to(value.dtype)
@@ -90,11 +91,15 @@ class _RMSNormSiLU(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         value, scale, weight = ctx.saved_tensors
-        unit = value.float() * scale
-        inner = torch.ops.aten.silu_backward(gradient.float(), unit * weight)
+        unit = _precise(value) * scale
+        inner = torch.ops.aten.silu_backward(_precise(gradient), unit * weight)
         along, of_weight = _gradients(inner, unit, weight)
         of_unit = inner.mul_(weight)  # in place: images are large
         return of_unit.addcmul_(unit, along, value=-1 / len(weight)).mul_(scale).to(gradient.dtype), of_weight, None
+
+
+def _precise(value: Tensor) -> Tensor:
+    return value.to(torch.promote_types(value.dtype, torch.float32))
 
 
 def _scale(x: Tensor, eps: Tensor) -> Tensor:
