@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import gymnasium
 import numpy as np
+import pygame
 import pytest
 
-from torchrl_ocwm.envs import Reacher
+from torchrl_ocwm.envs import ENVIRONMENTS, Reacher
 
 
 @pytest.fixture
@@ -50,3 +52,19 @@ def test_without_a_mode_there_is_nothing_to_see(make: Callable[..., Reacher]) ->
 def test_a_size_that_there_is_not(make: Callable[..., Reacher]) -> None:
     with pytest.raises(ValueError, match="render_size must be at least 1, got 0"):
         make(render_mode="rgb_array", render_size=0)
+
+
+@pytest.mark.filterwarnings("ignore:.*natively support.*")
+def test_a_window_shows_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gymnasium opens it."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    options = {"image_size": 16, "render_size": 40}
+    env = gymnasium.make(ENVIRONMENTS["reacher"].id, render_mode="human", **options)
+    try:
+        env.reset(seed=1)
+        for _ in range(2):
+            env.step(env.action_space.high)
+            shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
+            np.testing.assert_array_equal(shown, env.unwrapped.render())
+    finally:
+        env.close()

@@ -66,7 +66,8 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
             (:class:`~torchrl_ocwm.envs.ColourMasks`), as with a real camera; 0 for the simulator's masks at every step.
         camera_options: Passed to :class:`~torchrl_ocwm.envs.Camera`: shadows, reflections, multisampling, max_geoms.
         privileged: Add ``object_position_true`` to the observations.
-        render_mode: ``"rgb_array"`` makes :meth:`render` return the camera's picture (H, W, 3).
+        render_mode: ``"rgb_array"`` makes :meth:`render` return the camera's picture (H, W, 3). For ``"human"``,
+            :func:`gymnasium.make` shows it in a window.
         render_size: Pixels on a side of that picture; ``None``: the image that the agent sees.
 
     Attributes:
