@@ -15,7 +15,16 @@ import pytest
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from torchrl_ocwm.agents import AGENTS, SIZES, Adam, LatentSimilarity, ObjectCentric, StateEntropy
+from torchrl_ocwm.agents import (
+    AGENTS,
+    EXPLORERS,
+    SIZES,
+    Adam,
+    FullLatent,
+    LatentSimilarity,
+    ObjectCentric,
+    StateEntropy,
+)
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.recipes import keep_settings
 from torchrl_ocwm.settings import Settings, change, field_docs, to_dict
@@ -226,13 +235,29 @@ class TestGroups:
         assert settings.size.learning.optimizer == Adam(max_norm=5.0)
         assert settings.training.loggers == ("tensorboard",)
 
-    def test_what_both_parts_have_stays(self, compose: Callable[..., Any]) -> None:
-        """As Hydra merges everything else."""
-        arguments = ("agent=focus_lcp", "agent.behaviours.reach.reward={name:latent_similarity,distance:cosine}")
-        reach = compose("train_offline", *arguments).agent.behaviours["reach"]
-        assert (reach.reward, reach.goal.weight) == (LatentSimilarity("cosine"), 100.0)
+    def test_another_part_has_its_own_defaults(self, compose: Callable[..., Any]) -> None:
+        """Hydra merges it with the part that it replaces; only what is given stays, be it what was there before."""
+        apt = "agent.behaviours.explore.reward"
+        row = ("train_offline", "agent=focus_lcp", "explore=focus_explore")
+        before = AGENTS["focus_lcp"].and_behaviours(explore=EXPLORERS["focus_explore"]).behaviours["explore"].reward
+        assert (before.k, before.clip) == (30, 1e-4)
+        for changes, expected in (
+            ((f"{apt}={{name:state_entropy}}",), StateEntropy()),
+            ((f"{apt}={{name:state_entropy,k:30}}",), StateEntropy(k=30)),
+            ((f"{apt}={{name:state_entropy}}", f"{apt}.k=30"), StateEntropy(k=30)),
+        ):
+            assert compose(*row, *changes).agent.behaviours["explore"].reward == expected
+        goal, reward = (
+            "agent.behaviours.reach.goal={name:full_latent}",
+            "agent.behaviours.reach.reward=full_latent_cosine",
+        )
+        assert compose(*row, goal, reward).agent.behaviours["reach"].goal == FullLatent()
         said = compose("train_offline", "agent.world_model={name:object,lambda_proprio:5}").agent.world_model
         assert said == ObjectCentric(lambda_proprio=5.0)
+
+    def test_an_explorer_beside_an_explorer(self, compose: Callable[..., Any]) -> None:
+        said = compose("train_offline", "agent=focus_explore", "explore=apt")
+        assert said == "SettingsError: agent=focus_explore explores already; take explore=none, or another agent"
 
     def test_parts_of_an_explorer(self, compose: Callable[..., Any]) -> None:
         changed = "agent.behaviours.explore.reward={name:state_entropy,k:3}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
@@ -19,13 +19,14 @@ from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.files import as_file_name, seen_from
-from torchrl_ocwm.parts import Part, load_plugins
+from torchrl_ocwm.parts import load_plugins
 from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
 
 with needs("a recipe", "recipes"):
     import hydra
     from hydra.core.config_store import ConfigStore
     from hydra.core.hydra_config import HydraConfig
+    from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.types import RunMode
     from omegaconf import DictConfig, OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -195,22 +196,47 @@ def _given(config: DictConfig) -> dict[str, Any]:
     if lacking := sorted(OmegaConf.missing_keys(config)):
         raise SettingsError(f"{lacking[0]} is missing; give it, as in {lacking[0]}=...")
     values: Any = OmegaConf.to_container(config, resolve=True)
-    choices = HydraConfig.get().runtime.choices
-    rows = {group: to_dict(known.get(str(choices.get(group)))) for group, known in (("agent", AGENTS), ("size", SIZES))}
-    if rows["agent"] and choices.get("explore") in EXPLORERS:
-        rows["agent"]["behaviours"][EXPLORE] = to_dict(EXPLORERS[choices["explore"]])
-    return {name: _without_leftovers(value, rows.get(name)) for name, value in values.items()}
+    hydra_config = HydraConfig.get()
+    rows, given = _rows(hydra_config.runtime.choices), {*_named(hydra_config.overrides.task)}
+    return {name: _without_leftovers(value, rows.get(name), given, name) for name, value in values.items()}
 
 
-def _without_leftovers(values: Any, row: Any) -> Any:
+def _rows(choices: Mapping[str, Any]) -> dict[str, Any]:
+    """The agent and the size that are chosen.
+
+    Raises:
+        SettingsError: for an explorer beside an explorer.
+    """
+    name, explorer = str(choices.get("agent")), choices.get("explore")
+    agent = to_dict(AGENTS.get(name))
+    if agent and explorer in EXPLORERS:
+        if EXPLORE in agent["behaviours"]:
+            raise SettingsError(f"agent={name} explores already; take explore=none, or another agent")
+        agent["behaviours"][EXPLORE] = to_dict(EXPLORERS[explorer])
+    return {"agent": agent, "size": to_dict(SIZES.get(str(choices.get("size"))))}
+
+
+def _named(overrides: Iterable[str]) -> Iterator[str]:
+    """The dotted names of all settings that the command line gives."""
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        yield from _leaves(override.value(), override.key_or_group)
+
+
+def _leaves(value: Any, at: str) -> Iterator[str]:
+    if isinstance(value, dict):
+        for name, part in value.items():
+            yield from _leaves(part, f"{at}.{name}")
+    else:
+        yield at
+
+
+def _without_leftovers(values: Any, row: Any, given: Set[str], at: str) -> Any:
     """A row with changes, without the settings of parts that others replaced: Hydra merges the two."""
     if not isinstance(values, dict) or not isinstance(row, dict):
         return values
     if values.get("name") == row.get("name"):
-        return {name: _without_leftovers(value, row.get(name)) for name, value in values.items()}
-    named: list[Any] = [kind.get(str(values.get("name"))) for kind in Part.registered.values()]
-    known = {one.name for part in named if part is not None for one in fields(part)}
-    return {name: value for name, value in values.items() if name in known or row.get(name) != value}
+        return {name: _without_leftovers(value, row.get(name), given, f"{at}.{name}") for name, value in values.items()}
+    return {name: value for name, value in values.items() if row.get(name) != value or f"{at}.{name}" in given}
 
 
 def _default(one: Any) -> Any:
