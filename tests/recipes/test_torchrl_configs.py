@@ -12,8 +12,10 @@ from omegaconf import DictConfig
 from torchrl.collectors import Collector
 from torchrl.trainers.algorithms import DreamerV3Optimizer
 
+from torchrl_ocwm.agents import AGENTS, EXPLORERS
 from torchrl_ocwm.agents.optimizers import ClippedAdam
 from torchrl_ocwm.recipes import torchrl_configs  # noqa: F401  (fills the store)
+from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records
 
 DEFAULTS = [{"env": "ocwm"}, {"loss": "ocwm"}, {"optimizer": "ocwm_adam"}, {"collector": "sync"}, "_self_"]
@@ -49,6 +51,13 @@ def test_a_loss_by_the_name_of_its_row_learns_with_the_optimizer(config: DictCon
     assert any(not torch.equal(*pair) for pair in zip(before, loss.agent.actor.parameters(), strict=True))
 
 
+def test_an_agent_with_settings_of_its_own_and_an_explorer() -> None:
+    row = ["+agent=focus_lcp", "loss.agent=${agent}", "agent.behaviours.reach.goal.weight=7", "+explore=apt"]
+    made = instantiate(compose(*row).loss).agent.config
+    expected = change(AGENTS["focus_lcp"], {"behaviours.reach.goal.weight": 7.0})
+    assert made == expected.and_behaviours(explore=EXPLORERS["apt"])
+
+
 def test_torchrls_collector_runs_the_policy_in_the_environment(config: DictConfig) -> None:
     policy = instantiate(config.loss).agent.policy()
     collector = instantiate(config.collector, policy=policy)
@@ -70,6 +79,7 @@ def test_every_optimizer_has_its_settings() -> None:
     ("override", "message"),
     [
         ("loss.agent=focus_lpc", "unknown agent 'focus_lpc'; there are dreamer"),
+        ("+loss.agent.behaviours.reach.object=cube", "loss.agent must be a whole row, with world_model and behaviours"),
         ("env.name=reach", "name must be one of reacher"),
         ("env.options.horizon=0", "options.horizon must be at least 1, got 0"),
     ],

@@ -75,6 +75,14 @@ def recipe(
 
 def store_options() -> None:
     """Put agents, explorers, sizes and environments into Hydra's store, those of plugins too."""
+    store_rows()
+    store = ConfigStore.instance()
+    for name, environment in ENVIRONMENTS.items():
+        store.store(name, {"name": name, "options": defaults(environment.options)}, group="env")
+
+
+def store_rows() -> None:
+    """Put agents, explorers and sizes into Hydra's store, those of plugins too."""
     load_plugins()
     store = ConfigStore.instance()
     for group, rows in (("agent", AGENTS), ("size", SIZES)):
@@ -85,8 +93,6 @@ def store_options() -> None:
     for name, behaviour in EXPLORERS.items():  # beside the behaviours of the row
         node = OmegaConf.create(to_dict(behaviour), flags={"struct": False})
         store.store(name, node, group="explore", package=f"agent.behaviours.{EXPLORE}")
-    for name, environment in ENVIRONMENTS.items():
-        store.store(name, {"name": name, "options": defaults(environment.options)}, group="env")
 
 
 @contextmanager

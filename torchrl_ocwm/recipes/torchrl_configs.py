@@ -1,6 +1,7 @@
-"""Agents' losses, environments and optimisers in the Hydra store of TorchRL's own trainer configurations.
+"""Agents, their losses, environments and optimisers in the Hydra store of TorchRL's own trainer configurations.
 
-Importing this module adds them beside TorchRL's: ``loss=ocwm env=ocwm loss.agent=focus_lcp`` composes.
+Importing this module adds them beside TorchRL's: ``loss=ocwm env=ocwm loss.agent=focus_lcp`` composes. With settings of
+its own an agent is a group: ``+agent=focus_lcp loss.agent='${agent}' agent.behaviours.reach.object=cube``.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from torchrl_ocwm.agents import AgentConfig, OptimizerPart, Size, build_agent
 from torchrl_ocwm.envs.registry import EnvChoice, make_env, make_task
 from torchrl_ocwm.objectives import GoalConditionedDreamerLoss
 from torchrl_ocwm.parts import Part
-from torchrl_ocwm.recipes.config import defaults
-from torchrl_ocwm.settings import from_dict
+from torchrl_ocwm.recipes.config import defaults, store_rows
+from torchrl_ocwm.settings import SettingsError, from_dict
 
 _HERE = __name__
 
@@ -52,7 +53,7 @@ class OCWMLossConfig(LossConfig):
     """The loss of an agent that is built for the environment ``env=ocwm``, or another one by name.
 
     Args:
-        agent: Name of a row, or a row of choices.
+        agent: Name of a row, or a whole row of choices, such as ``${agent}``.
         size: Name of a size, or a size.
         env: Name of the environment.
         options: Its options.
@@ -84,11 +85,20 @@ def make_loss(
         ValueError: for an unknown name, or choices that do not fit together.
     """
     choice = EnvChoice(env, _plain(options))
-    row = agent if isinstance(agent, str) else from_dict(AgentConfig, _plain(agent), "agent")
+    row = agent if isinstance(agent, str) else _row(_plain(agent))
     large = size if isinstance(size, str) else from_dict(Size, _plain(size), "size")
     built = build_agent(row, make_task(choice.name, **choice.options), large)
     built.loss.__dict__["agent"] = built  # not a submodule: it holds the loss
     return built.loss
+
+
+def _row(agent: Mapping[str, Any]) -> AgentConfig:
+    if "world_model" not in agent:  # Hydra puts a setting below a name in its place
+        raise SettingsError(
+            "loss.agent must be a whole row, with world_model and behaviours; for a row with other settings add "
+            "+agent=NAME loss.agent='${agent}' and change agent"
+        )
+    return from_dict(AgentConfig, agent, "agent")
 
 
 def make_optimizer(params: Iterable[nn.Parameter], *, lr: float, **part: Any) -> Optimizer:
@@ -104,6 +114,7 @@ def make_optimizer(params: Iterable[nn.Parameter], *, lr: float, **part: Any) ->
 
 def store() -> None:
     """Put all into Hydra's store, those of plugins too; done when this module is imported."""
+    store_rows()
     configs = ConfigStore.instance()
     configs.store(group="env", name="ocwm", node=OCWMEnvConfig)
     configs.store(group="loss", name="ocwm", node=OCWMLossConfig)
