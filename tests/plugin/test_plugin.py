@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -29,20 +28,6 @@ from torchrl_ocwm.settings import SettingsError, change, to_dict
 from torchrl_ocwm.testing import random_records, reacher_task
 
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def plugin(registries: None) -> Iterator[None]:
-    """The package can be found, and is gone afterwards."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(HERE)
-        patch.setenv("PYTHONPATH", os.pathsep.join([str(HERE), str(ROOT), os.environ.get("PYTHONPATH", "")]))
-        patch.setenv(VARIABLE, "ocwm_example")
-        load_plugins.cache_clear()
-        yield
-    for name in [name for name in sys.modules if name.split(".")[0] == "ocwm_example"]:
-        del sys.modules[name]
-    load_plugins.cache_clear()
 
 
 LOAD = """
@@ -71,6 +56,7 @@ def all_parts() -> Agent:
             "behaviours.reach.reward": {"name": "nearness", "width": 0.2},
             "behaviours.reach.goals": "remembered",
             "behaviours.explore": {"reward": "novelty"},
+            "behaviours.point": {"goal": {"name": "waves", "number": 3}, "reward": "in_phase", "goals": "frames"},
         },
     )
     return build_agent(config, reacher_task(), change(SIZES["debug"], {"learning.optimizer": "sgd"}))
@@ -93,7 +79,7 @@ def test_all_kinds_of_parts() -> None:
     losses = agent.loss(random_records(reacher_task(), 2, 3))
     assert losses["loss_explore_novelty"] > 0
     rates = [group["lr"] for group in agent.parameter_groups()]
-    assert rates[-1] == 1e-2
+    assert rates.count(1e-2) == 1
     optimizer = agent.size.learning.optimizer.build(agent.parameter_groups())
     assert type(optimizer) is torch.optim.SGD
     guess = agent.behaviour("explore").loss.reward_loss.network.guess
@@ -101,6 +87,21 @@ def test_all_kinds_of_parts() -> None:
     losses["loss_explore_novelty"].backward()
     optimizer.step()
     assert not torch.equal(guess.weight, before)
+
+
+def test_a_goal_of_positions_and_of_frames() -> None:
+    point = all_parts().behaviour("point")
+    place = torch.tensor([0.5, -0.25])
+    angles = torch.tensor([0.5, 1.0, 1.5, -0.25, -0.5, -0.75])
+    torch.testing.assert_close(point.goal.position(place), torch.cat([angles.sin(), angles.cos()]))
+    assert point.goal.features == 12
+    records = random_records(reacher_task(), 2, 3)
+    agent = all_parts()
+    frames = agent.model.records()(records)["next"]
+    goals = agent.behaviour("point").loss.imagination_start(frames)["latent", "goal"]
+    seen = agent.behaviour("point").goal.position(frames["object_units"].flatten(0, 1))
+    assert torch.cdist(goals.flatten(0, -2), seen).min(1).values.max() < 1e-5
+    assert agent.loss(records)["loss_point_actor"].isfinite()
 
 
 def test_a_goal_source_with_a_buffer_is_saved_moved_and_seen() -> None:
@@ -125,7 +126,13 @@ def test_a_fresh_process_loads_an_agent_of_such_parts(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     line, config = done.stdout.splitlines()
     assert "Nearness(width=0.2)" in config
-    for part in ("world_model 'wide'", "reward 'nearness'", "goal_source 'remembered'", "optimizer 'sgd'"):
+    for part in (
+        "world_model 'wide'",
+        "reward 'nearness'",
+        "goal_source 'remembered'",
+        "goal 'waves'",
+        "optimizer 'sgd'",
+    ):
         assert f"{part} of the package 'ocwm_example'" in line
     assert line.endswith(f"install what registers them, or name it in {VARIABLE}")
 
@@ -182,12 +189,14 @@ def test_from_collected_data_to_a_table(tmp_path: Path) -> None:
     assert EpisodeDataset.open(data).task.name == "dots"
     training = ("updates=2", "eval_interval=2", "eval_episodes=2", "eval_steps=3", "video_interval=0")
     reach = ("reward.width=0.3", "goals=remembered", "object=blue")
-    parts = ("agent=nearness", *(f"agent.behaviours.reach.{one}" for one in reach))
+    parts = ("agent=nearness", "explore=novelty", *(f"agent.behaviours.reach.{one}" for one in reach))
     more = ("size=debug", "size.learning.optimizer=sgd", *(f"training.{one}" for one in training))
     done = example("train_offline.py", "env=dots", f"dataset={data}", f"output={run}", *parts, *more)
     assert done.returncode == 0, done.stderr
     agent = load_agent(run / "checkpoint.zip").agent
-    assert to_dict(agent.config)["behaviours"]["reach"]["reward"] == {"name": "nearness", "width": 0.3}
+    behaviours = to_dict(agent.config)["behaviours"]
+    assert behaviours["reach"]["reward"] == {"name": "nearness", "width": 0.3}
+    assert behaviours["explore"]["reward"] == {"name": "novelty", "lr": 1e-2}
     small = ("goals=4", "episode_steps=3", "workers=1", "envs=4", "video_goals=1", f"output={output}")
     done = example("evaluate.py", f"checkpoint={run / 'checkpoint.zip'}", *small)
     assert done.returncode == 0, done.stderr

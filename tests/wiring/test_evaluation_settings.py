@@ -219,6 +219,13 @@ def test_seed_of_a_diagnosis(diagnose: Callable[..., Played]) -> None:
     assert first["numbers"]["errors"] != other["numbers"]["errors"]
 
 
+@shows("Diagnosis.behaviour")
+def test_whose_goals_are_diagnosed(diagnose: Callable[..., Played]) -> None:
+    """Which object that is, tests/plugin shows."""
+    assert diagnose("behaviour=reach")["numbers"]["goal_latents"]
+    assert "unknown behaviour 'push'" in diagnose("behaviour=push")["printed"]
+
+
 @shows("Diagnosis.device")
 def test_device_of_a_diagnosis(diagnose: Callable[..., Played]) -> None:
     assert diagnose("device=cpu")["device"] == torch.device("cpu")

@@ -9,7 +9,7 @@ from torchrl_ocwm.data.importing import Importing, Keys, import_dataset
 from torchrl_ocwm.data.memory import release_pages
 from torchrl_ocwm.data.policies import ScriptedPolicy, SmoothRandomPolicy
 from torchrl_ocwm.data.records import STORED, episode_to_records
-from torchrl_ocwm.data.relabel import RelabelGoals
+from torchrl_ocwm.data.relabel import RelabelGoals, position_reward
 from torchrl_ocwm.data.replay import make_replay_buffer
 from torchrl_ocwm.data.settings import Collection
 from torchrl_ocwm.data.transformed import transform_dataset
@@ -36,6 +36,7 @@ __all__ = [
     "make_replay_buffer",
     "object_coverage",
     "object_positions",
+    "position_reward",
     "release_pages",
     "transform_dataset",
     "with_coverage",

@@ -6,6 +6,7 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import Transform
 
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
@@ -76,6 +77,24 @@ class RelabelGoals(Transform):
         if self._draws:
             goal = self.workspace.sample(position.shape[:-2]).to(position).unsqueeze(-2).expand_as(position)
             tensordict["next", "goal_position"] = goal.contiguous()
-        distance = torch.linalg.vector_norm(position - tensordict["next", "goal_position"], dim=-1, keepdim=True)
-        tensordict["next", "reward"] = -distance  # Eq. 1
+        goal = tensordict["next", "goal_position"]
+        tensordict["next", "reward"] = position_reward(positions, goal, self.object_index).unsqueeze(-1)
         return tensordict
+
+
+def position_reward(positions: Tensor, goal: Tensor, object_index: int = 0) -> Tensor:
+    """−‖p − p_g‖₂ of one object (paper, equation 1).
+
+    Args:
+        positions: ``[..., O, D]`` of all objects, metres.
+        goal: ``[..., D]``, metres.
+        object_index: Which object is to be positioned.
+
+    Returns:
+        ``[...]``, metres.
+
+    Examples:
+        >>> position_reward(torch.tensor([[0.0, 0.0], [3.0, 0.0]]), torch.tensor([0.0, 4.0]), object_index=1)
+        tensor(-5.)
+    """
+    return -torch.linalg.vector_norm(positions[..., object_index, :] - goal, dim=-1)

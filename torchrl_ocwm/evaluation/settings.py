@@ -62,6 +62,7 @@ class Diagnosis(Settings):
     """Settings of an examination of a world model on a dataset.
 
     Args:
+        behaviour: Whose goal latents are compared, those of its object; ``None``: of the behaviour that acts.
         sequences: Sequences from random places in episodes that are spread over the dataset.
         length: Frames of each.
         context: Frames that the world model sees before it imagines the rest from the actions alone.
@@ -79,6 +80,7 @@ class Diagnosis(Settings):
         50
     """
 
+    behaviour: str | None = None
     sequences: int = setting(100, at_least=1)
     length: int = setting(50, at_least=1)
     context: int = setting(5, at_least=1)

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm import load_agent
-from torchrl_ocwm.agents import Agent
+from torchrl_ocwm.agents import Agent, Policy
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.envs import Task
 from torchrl_ocwm.evaluation import (
@@ -58,10 +58,11 @@ def main(config: Diagnose) -> None:
     settings, output = config, Path(config.output)
     if settings.video_sequences:
         check_ffmpeg("video_sequences")
-    agent = load_agent(config.checkpoint, device=settings.device).agent
+    policy = load_agent(config.checkpoint, behaviour=settings.behaviour, device=settings.device)
+    agent = policy.agent
     records = _records(Path(config.dataset), config.checkpoint, agent.task, settings)
     torch.manual_seed(settings.seed)
-    errors, goals = _errors(agent, records, settings, output), _goals(agent, records, settings, output)
+    errors, goals = _errors(agent, records, settings, output), _goals(policy, records, settings, output)
     table = "\n\n".join(part for part in (error_table(errors, agent.task.objects), goal_table(goals)) if part)
     numbers = {"objects": agent.task.objects, "errors": errors, "goal_latents": goals}
     with writing(output / "diagnosis.json") as file:
@@ -101,12 +102,11 @@ def _drawn(agent: Agent, settings: Diagnosis, *, imagined: bool, latents: bool) 
     return [name for name, there in names.items() if there]
 
 
-def _goals(agent: Agent, records: TensorDictBase, settings: Diagnosis, output: Path) -> dict[str, dict[str, float]]:
+def _goals(policy: Policy, records: TensorDictBase, settings: Diagnosis, output: Path) -> dict[str, dict[str, float]]:
     """Goal latents of the object that is to be positioned, if the agent has such."""
-    model = agent.model
+    model, index = policy.agent.model, policy.object_index
     if not isinstance(model, ObjectWorldModel) or model.positional_encoder is None:
         return {}
-    index = agent.policy().object_index
     pairs, positions = latent_pairs(model, records, frames=settings.frames, object_index=index, seed=settings.seed)
     draw_goal_latents(output / "goal_latents.png", pairs, positions)
     return {name: match(*pair, positions) for name, pair in pairs.items()}

@@ -7,6 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm.agents import Policy
+from torchrl_ocwm.data import position_reward
 from torchrl_ocwm.evaluation import (
     EvaluationEnvs,
     Footage,
@@ -55,8 +56,9 @@ def score(
             object_index=policy.object_index,
             seed=seed,
         )
-    if "reward_head" in policy.behaviour.config.reward.needs:  # which learns the rewards of the environment
-        gamma, reward = policy.agent.size.learning.gamma, episodes["reward"].squeeze(-1)
+    if "reward_head" in policy.behaviour.config.reward.needs:  # which learns the rewards of the records
+        gamma = policy.agent.size.learning.gamma
+        reward = position_reward(episodes["object_position"], episodes["goal_position"], policy.object_index)
         errors["predicted_return"] = predicted_return(policy.behaviour, episodes["latent"][:, 0])
         errors["obtained_return"] = (reward * gamma ** torch.arange(reward.shape[1])).sum(1)
     return {**measure(episodes, object_index=policy.object_index), **errors}

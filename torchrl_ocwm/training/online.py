@@ -15,7 +15,7 @@ from torchrl.trainers.algorithms import DreamerV3UpdateRatio
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.checkpoint import collecting_policy, describe, rebuild
-from torchrl_ocwm.data import STORED, Collection, EpisodeDataset, collect, episode_to_records
+from torchrl_ocwm.data import STORED, Collection, EpisodeDataset, collect, episode_to_records, position_reward
 from torchrl_ocwm.data.collect import check_failures, count_episode
 from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs import find_environment, make_env
@@ -180,6 +180,7 @@ class Player:
     def __init__(self, agent: Agent, dataset: EpisodeDataset, online: Online, *, seed: int) -> None:
         self.dataset, self.online = dataset, online
         self.behaviours = online.behaviours or tuple(agent.behaviours)
+        self._objects = [agent.policy(name).object_index for name in self.behaviours]
         self._learning = Turns(agent, self.behaviours, seed=seed)
         copy = rebuild(describe(agent)).eval().requires_grad_(False)
         self._acting = Turns(copy, self.behaviours, seed=seed)
@@ -201,7 +202,7 @@ class Player:
         while len(rewards) < self.online.round_episodes and not self.stop.stopped:
             for episode in self.stop.look(self._next_episodes) or ():
                 self._append(episode)
-                rewards.append(float(episode["next", "reward"].mean()))
+                rewards.append(self._mean_reward(episode))
         if rewards:
             mean = sum(rewards) / len(rewards)
             self._played = {"collected/steps": float(self.dataset.num_steps), "collected/reward": mean}
@@ -241,6 +242,11 @@ class Player:
         first = index.get(_NEXT, 0) + self._failures * max(self.online.workers, 1)
         self._collector = make_collector(make, self._acting, self.online, first=first, chunk=chunk)
         self._batches, self._sent = iter(self._collector), False
+
+    def _mean_reward(self, episode: TensorDictBase) -> float:
+        """Of the object that whoever played the episode is about."""
+        seen, index = episode["next"], self._objects[int(episode[NUMBER][0]) % len(self._objects)]
+        return float(position_reward(seen["object_position"], seen["goal_position"], index).mean())
 
     def _append(self, episode: TensorDictBase) -> None:
         number = int(episode[NUMBER][0])

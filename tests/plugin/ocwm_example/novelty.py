@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from torchrl_ocwm.agents import GoalEncoding, ImaginedReward, Reward, Scene, register
+from torchrl_ocwm.agents import EXPLORERS, Behaviour, GoalEncoding, ImaginedReward, Reward, Scene, register
 from torchrl_ocwm.settings import setting
 
 
@@ -57,3 +57,6 @@ class Novelty(Reward):
         network = RandomDistillation(scene.architecture.categoricals * scene.architecture.classes)
         reward = TensorDictModule(network, [("latent", "state")], ["reward"])
         return ImaginedReward(reward, RandomDistillationLoss(network), self.lr)
+
+
+EXPLORERS["novelty"] = Behaviour(reward=Novelty())
