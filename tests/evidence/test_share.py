@@ -12,6 +12,7 @@ import torch
 
 from torchrl_ocwm import load_agent, save_agent
 from torchrl_ocwm.agents import build_agent
+from torchrl_ocwm.data import Collection, collect
 from torchrl_ocwm.envs import make_task
 from torchrl_ocwm.evaluation import Report
 from torchrl_ocwm.evidence import Collected, Evaluated, Record, RecordError, Trained, share
@@ -98,6 +99,7 @@ def plain(tmp_path: Path) -> Path:
         "training: {updates: 1500, seed: 4}\n"
         "online: {seed_steps: [70, 30], seed_policy: [scripted, random], update_ratio: 0.5}\n"
     )
+    (run / "made.json").write_text('{"commit": "abc", "machine": "a machine"}')
     report = Report(torch.zeros(1, 2), {"goals": 1, "episode_steps": 7})
     report.add("random", {"final_score": torch.tensor([0.25])}, source="smooth actions")
     report.add("dreamer_pcp", {"final_score": torch.tensor([0.75])}, source=run / "checkpoint.zip")
@@ -110,8 +112,19 @@ def test_runs_of_other_commands(plain: Path, tmp_path: Path) -> None:
     assert load_agent(tmp_path / "shared").agent.task == reacher_task()
     assert "| training | 1,500 updates, seed 4 |" in card
     assert "| data | 70 scripted steps and 30 random steps, and then its own, 0.5 updates per step |" in card
-    (tmp_path / "run" / "config.yaml").write_text("training: {updates: 1500, seed: 4}\n")
-    assert "| data |" not in (share(plain, tmp_path / "shared") / "README.md").read_text()
+    assert "| commit | abc |\n| machine | a machine |" in card
+
+
+def test_runs_on_a_dataset(plain: Path, tmp_path: Path) -> None:
+    (tmp_path / "run" / "config.yaml").write_text("training: {updates: 1500, seed: 4}\ndataset: ../data\n")
+    (tmp_path / "run" / "made.json").unlink()  # of a release before
+    card = (share(plain, tmp_path / "shared") / "README.md").read_text()
+    assert "| data | not where it was |" in card
+    assert "| commit |" not in card
+    collected = Collection(steps=25, workers=0)
+    with collect(tmp_path / "data", "reacher", collected, options={"image_size": 16, "horizon": 10}, progress=False):
+        card = (share(plain, tmp_path / "shared") / "README.md").read_text()
+    assert "| data | 30 steps, 3 random episodes |" in card
 
 
 def test_what_is_missing_of_them(plain: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -26,6 +27,7 @@ from torchrl_ocwm.agents import (
     StateEntropy,
 )
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
+from torchrl_ocwm.provenance import commit, machine
 from torchrl_ocwm.recipes import keep_settings
 from torchrl_ocwm.settings import Settings, change, field_docs, to_dict
 from torchrl_ocwm.testing import random_dataset, reacher_task
@@ -350,6 +352,8 @@ class TestHydra:
     def test_keeps_what_it_ran_with(self, tmp_path: Path) -> None:
         keep_settings(Training(updates=3), tmp_path / "run")
         assert OmegaConf.load(tmp_path / "run" / "config.yaml") == to_dict(Training(updates=3))
+        made = json.loads((tmp_path / "run" / "made.json").read_text())
+        assert made == {"commit": commit(), "machine": machine()}
 
 
 def test_groups_that_a_recipe_does_not_take_are_plain_settings_in_it(compose: Callable[..., Any]) -> None:

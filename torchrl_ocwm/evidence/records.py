@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
-import subprocess
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -89,34 +85,3 @@ class Record:
         """
         with writing(folder / RECORD) as file:
             file.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
-
-
-def machine() -> str:
-    """Where this runs, in words.
-
-    Examples:
-        >>> "cores" in machine()
-        True
-    """
-    return f"{_processor()}, {os.cpu_count()} cores"
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:  # not Linux
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def commit() -> str:
-    """The commit of the checkout that this package is in, with a plus if it has been changed; else its release."""
-    checkout = Path(__file__).parents[2]
-    try:
-        if not (checkout / ".git").exists():  # an installed one may lie in a checkout of something else
-            return version("torchrl-ocwm")
-        git = ["git", "-C", str(checkout), "describe", "--always", "--abbrev=8", "--exclude=*", "--dirty=+"]
-        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return version("torchrl-ocwm")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,12 @@ from torchrl_ocwm.agents import agent_name, load_agent, save_agent
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.agents.presets import flat
 from torchrl_ocwm.agents.sources import AGENT_FILE
+from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.report import Report
 from torchrl_ocwm.evidence.estimate import in_words
 from torchrl_ocwm.evidence.records import RECORD, Record, RecordError
+from torchrl_ocwm.provenance import MADE
 from torchrl_ocwm.training import CHECKPOINT
 
 CARD = "README.md"
@@ -83,13 +87,28 @@ def _of_evaluate(evaluation: Path) -> tuple[Path, dict[str, str]]:
     if not settings.exists():
         raise RecordError(f"{settings}: no such file; the card says what it has of the training")
     config: Any = OmegaConf.to_container(OmegaConf.load(settings))
-    training, online = config["training"], config.get("online")
-    facts = {"training": f"{training['updates']:,} updates, seed {training['seed']}"}
-    if online is not None:
+    training = config["training"]
+    facts = {
+        "training": f"{training['updates']:,} updates, seed {training['seed']}",
+        "data": _data(config, settings.parent),
+    }
+    made = settings.parent / MADE
+    return files[0], {**facts, **(json.loads(made.read_text(encoding="utf-8")) if made.exists() else {})}
+
+
+def _data(config: Mapping[str, Any], folder: Path) -> str:
+    """Who collected what a run in a folder learnt from, as far as its settings and its dataset say."""
+    if (online := config.get("online")) is not None:
         seeded = zip(online["seed_steps"], online["seed_policy"], strict=True)
         first = " and ".join(f"{count:,} {policy} steps" for count, policy in seeded)
-        facts["data"] = f"{first}, and then its own, {online['update_ratio']} updates per step"
-    return files[0], facts
+        return f"{first}, and then its own, {online['update_ratio']} updates per step"
+    try:
+        with EpisodeDataset.open(folder / config["dataset"]) as dataset:
+            policies = dataset.metadata.get("policies", {})
+            episodes = " and ".join(f"{count:,} {policy} episodes" for policy, count in policies.items())
+            return f"{dataset.num_steps:,} steps, {episodes or 'recordings'}"
+    except DatasetError:
+        return "not where it was"
 
 
 def _card(name: str, agent: Agent, more: dict[str, str], report: Report) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set
@@ -20,6 +21,7 @@ from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.files import as_file_name, seen_from
 from torchrl_ocwm.parts import load_plugins
+from torchrl_ocwm.provenance import MADE, commit, machine
 from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
 
 with needs("a recipe", "recipes"):
@@ -117,11 +119,15 @@ def _check_choices(groups: Iterable[str], arguments: Iterable[str]) -> None:
 def keep_settings(settings: Any, folder: Path) -> None:
     """Keep the settings of a run in its folder, as ``config.yaml``, with paths as seen from there.
 
+    ``made.json`` beside it says which commit runs it, and on which machine.
+
     Raises:
         OutputError: if it cannot be written.
     """
     with writing(folder / "config.yaml") as new:
         OmegaConf.save(OmegaConf.create(kept(settings, folder)), new)
+    with writing(folder / MADE) as new:
+        new.write_text(json.dumps({"commit": commit(), "machine": machine()}) + "\n", encoding="utf-8")
 
 
 def kept(settings: Any, folder: Path) -> dict[str, Any]:
