@@ -25,3 +25,13 @@ def test_tables_of_the_readme() -> None:
             shown = f"`{agent}`".replace(", image goals`", "`, goals as images").replace("`random`", "random actions")
             score = cell(report(name), agent, "final_score")
             assert re.search(rf"^\| {shown}(, 7,500 updates.*)? \| {score} \|$", text, re.MULTILINE), (name, agent)
+
+
+def test_the_stronger_baselines_in_the_readme() -> None:
+    found = report("figures/table-reacher-cpu/reacher")
+    scores = [cell(found, name, "final_score") for name in ("dreamer, weights 200", "focus, weights 200")]
+    means = [cell(found, name, "final_score").split(" ")[0] for name in ("dreamer_pcp", "focus_lcp")]
+    said = f"{scores[0]} and {scores[1]} after 1,500 updates, where `dreamer_pcp` has {float(means[0]):.2f} and"
+    text = " ".join((ROOT / "README.md").read_text().split())
+    assert f"{said} `focus_lcp` {float(means[1]):.2f} ([two seeds]" in text
+    assert len(found.rows["focus_lcp"].runs) == 2
