@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from torchrl_ocwm.data import (
     import_dataset,
 )
 from torchrl_ocwm.data.convert import no_workspace
-from torchrl_ocwm.envs import ActionRange, Workspace
+from torchrl_ocwm.envs import ActionRange
 from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.settings import SettingsError, change
 from torchrl_ocwm.testing import random_dataset, reacher_task
@@ -196,7 +197,6 @@ def test_lerobot_version_2_in_its_documented_layout(tmp_path: Path) -> None:
         import_dataset(tmp_path / "arm", tmp_path / "other")
 
 
-@pytest.mark.filterwarnings("ignore")  # Minari asks for authors and code
 @pytest.mark.parametrize(
     ("kind", "destination", "module"),
     [("npz", "out", "numpy"), ("hdf5", "out/demos.hdf5", "h5py"), ("minari", "my_arm/test-v0", "minari")],
@@ -212,7 +212,9 @@ def test_what_is_exported_can_be_imported_again(
     changes = {"plain": {}, "range": {"action_range": joints}, "discrete": {"discrete": True}}[actions]
     task = change(reacher_task((10, 40)), changes)
     dataset = random_dataset(tmp_path / "data", task, episodes=2, length=5)
-    export_dataset(dataset, destination, kind)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # Minari asks for authors and code
+        export_dataset(dataset, destination, kind)
     ends = {"action_low": joints.low, "action_high": joints.high} if actions == "range" else {}
     box = {"low": task.workspace.low, "high": task.workspace.high}
     settings = Importing(
@@ -225,9 +227,18 @@ def test_what_is_exported_can_be_imported_again(
             torch.testing.assert_close(dataset[1][key][1:], again[1][key][1:])
         else:
             torch.testing.assert_close(dataset.records[key], again.records[key], msg=str(key))
-    if kind != "minari":
-        with pytest.raises(DatasetError, match="is there already"):
-            export_dataset(dataset, destination, kind)
+    with pytest.raises(DatasetError, match="is there already"):
+        export_dataset(dataset, destination, kind)
+
+
+@pytest.mark.parametrize("name", ["demos", "my_arm/demos", "my arm/demos-v0", "demos-v", ""])
+def test_a_minari_dataset_has_a_version(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    dataset = random_dataset(tmp_path / "data", reacher_task(16))
+    with pytest.raises(DatasetError, match=f"{name!r} is no id of a Minari dataset; .* as in demos-v0"):
+        export_dataset(dataset, name, "minari")
+    assert not (tmp_path / "minari").exists()
 
 
 def test_only_lerobots_own_library_writes_its_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

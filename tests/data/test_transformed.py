@@ -84,7 +84,7 @@ def test_recordings_without_masks_get_some(tmp_path: Path) -> None:
 
 
 class Positioned(Transform):
-    """Puts the object at the same places ``[T, D]`` in each episode; hidden at the last, where the place means nothing."""
+    """Puts the object at the same places ``[T, D]`` in each episode; hidden where the place means nothing."""
 
     def __init__(self, places: list[list[float]], hidden: tuple[int, ...] = (-1,)) -> None:
         super().__init__()

@@ -263,7 +263,8 @@ class Recordings:
         position = self._metres(torch.cat(read), objects)[:, 0]
         seen = position[position.isfinite().all(-1)]
         if not len(seen):
-            raise SourceError(f"{self.source.path}: {self.settings.objects[0]} is hidden in all frames; give low and high")
+            name = self.settings.objects[0]
+            raise SourceError(f"{self.source.path}: {name} is hidden in all frames; give low and high")
         return workspace_around(seen)
 
     def _action_range(self, actions: Tensor) -> ActionRange | None:
