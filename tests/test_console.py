@@ -77,6 +77,9 @@ def test_the_words_after_a_command_are_its_recipes(called: Callable[..., list[li
         (("play", "--help"), ["--help"]),
         (("play",), []),
         (("evaluate", "reacher/focus_lcp", "goals=9"), ["checkpoint='reacher/focus_lcp'", "goals=9"]),
+        (("diagnose", "reacher/focus_lcp", "dataset=d"), ["checkpoint='reacher/focus_lcp'", "dataset=d"]),
+        (("import", "demos.hdf5"), ["source='demos.hdf5'"]),
+        (("share", "outputs/evaluation"), ["evaluation='outputs/evaluation'"]),
         (("collect", "reacher"), ["reacher"]),
     ],
 )

@@ -403,8 +403,14 @@ def test_places_that_hold_nothing_or_something_else(tmp_path: Path) -> None:
     pytest.importorskip("h5py")
     with pytest.raises(SourceError, match=r"bad\.h5: cannot be read as HDF5"):
         import_dataset(tmp_path / "bad.h5", tmp_path / "other")
+    for name in ("none.hdf5", "none.h5"):
+        with pytest.raises(SourceError, match=rf"{name}: no such file or folder$"):
+            import_dataset(tmp_path / name, tmp_path / "other")
+    for kind in ("npz", "lerobot", "hdf5"):
+        with pytest.raises(SourceError, match="nowhere: no such file or folder$"):
+            import_dataset(tmp_path / "nowhere", tmp_path / "other", Importing(format=kind))
     pytest.importorskip("minari")
-    with pytest.raises(SourceError, match="no Minari dataset on this machine"):
+    with pytest.raises(SourceError, match="no such file or folder, and no Minari dataset on this machine"):
         import_dataset("nobody/knows-v0", tmp_path / "other")
 
 

@@ -24,6 +24,7 @@ from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
 
 with needs("a recipe", "recipes"):
     import hydra
+    from hydra._internal.utils import get_args_parser
     from hydra.core.config_store import ConfigStore
     from hydra.core.hydra_config import HydraConfig
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -63,6 +64,7 @@ def recipe(
         def main() -> None:
             with _user_errors():
                 store_options()
+                _check_words(sys.argv[1:])
                 _check_choices(groups or {}, sys.argv[1:])
             ConfigStore.instance().store(name, _schema(kind, groups or {}, more))
             with _without(GROUPS - set(groups or {})):
@@ -104,6 +106,13 @@ def _without(groups: Iterable[str]) -> Iterator[None]:
         yield
     finally:
         repo.update(aside)
+
+
+def _check_words(arguments: Iterable[str]) -> None:
+    """Hydra's message for a word that is no setting does not say which one it is."""
+    for word in get_args_parser().parse_args([*arguments]).overrides:
+        if "=" not in word and not word.startswith("~"):
+            raise SettingsError(f"{word!r} was not understood; settings are given as NAME=VALUE, and --help shows them")
 
 
 def _check_choices(groups: Iterable[str], arguments: Iterable[str]) -> None:
