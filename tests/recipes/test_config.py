@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, fields
 from itertools import cycle
@@ -27,6 +28,7 @@ from torchrl_ocwm.agents import (
 )
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.recipes import keep_settings
+from torchrl_ocwm.recipes.config import recipe
 from torchrl_ocwm.settings import Settings, change, field_docs, to_dict
 from torchrl_ocwm.testing import random_dataset, reacher_task
 from torchrl_ocwm.training.settings import Training
@@ -350,6 +352,21 @@ class TestHydra:
     def test_keeps_what_it_ran_with(self, tmp_path: Path) -> None:
         keep_settings(Training(updates=3), tmp_path / "run")
         assert OmegaConf.load(tmp_path / "run" / "config.yaml") == to_dict(Training(updates=3))
+
+
+def test_warnings_are_one_line_while_a_recipe_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python shows a warning with what ``warnings.formatwarning`` makes of it."""
+    seen: list[str] = []
+
+    @recipe("warns")
+    def main(config: Training) -> None:
+        seen.append(warnings.formatwarning("images are\n  dark", UserWarning, "file.py", 3))
+
+    before = warnings.formatwarning
+    monkeypatch.setattr(sys, "argv", ["ocwm"])
+    main()
+    assert seen == ["UserWarning: images are dark\n"]
+    assert warnings.formatwarning is before
 
 
 def test_groups_that_a_recipe_does_not_take_are_plain_settings_in_it(compose: Callable[..., Any]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass
@@ -67,7 +68,7 @@ def recipe(
                 _check_words(sys.argv[1:])
                 _check_choices(groups or {}, sys.argv[1:])
             ConfigStore.instance().store(name, _schema(kind, groups or {}, more))
-            with _without(GROUPS - set(groups or {})):
+            with _short_warnings(), _without(GROUPS - set(groups or {})):
                 hydra.main(version_base="1.3", config_path=None, config_name=name)(guarded)()
 
         return main
@@ -183,6 +184,21 @@ def defaults(kind: Any) -> dict[str, Any]:
         {'warmup': 0}
     """
     return {one.name: _default(one) for one in fields(kind)}
+
+
+@contextmanager
+def _short_warnings() -> Iterator[None]:
+    """Warnings are one line too, without the line of code that gave them."""
+    before = warnings.formatwarning
+    warnings.formatwarning = _one_line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
+
+
+def _one_line(message: Warning | str, category: type[Warning], *place: Any) -> str:  # noqa: ARG001
+    return f"{category.__name__}: {' '.join(str(message).split())}\n"
 
 
 @contextmanager
