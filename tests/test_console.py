@@ -144,7 +144,7 @@ def test_exit_codes_and_help_in_another_folder(ocwm: Path, tmp_path: Path) -> No
     assert (wrong.returncode, wrong.stderr) == (1, "SettingsError: steps must be at least 1, got 0\n")
     shown = run("train", "--help")
     assert shown.returncode == 0
-    assert "training.updates=10000: Updates of model, actor and critic in all." in shown.stdout.splitlines()
+    assert "\ntraining.updates=10000: Updates of model, actor and critic in all. [whole number, 1 to" in shown.stdout
 
 
 def test_help_of_which_nobody_reads_more(ocwm: Path) -> None:

@@ -29,7 +29,8 @@ from torchrl_ocwm.agents import (
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.recipes import keep_settings
 from torchrl_ocwm.recipes.config import recipe
-from torchrl_ocwm.settings import Settings, change, field_docs, to_dict
+from torchrl_ocwm.recipes.help import help_text
+from torchrl_ocwm.settings import Settings, change, field_docs, plain_text, to_dict
 from torchrl_ocwm.testing import random_dataset, reacher_task
 from torchrl_ocwm.training.settings import Training
 
@@ -306,9 +307,17 @@ class TestHydra:
         script = str(EXAMPLES / "train_offline.py")
         done = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True, check=True)
         lines = done.stdout.splitlines()
-        assert "training.updates=10000: Updates of model, actor and critic in all." in lines
-        assert "training.loggers=[]: Where to log beside the CSV files." in lines
-        assert "dataset=data/{env.name}: Folder of the dataset to train on (collect)." in lines
+        assert [line for line in lines if line.startswith("training.updates=10000: Updates of model, actor and critic")]
+        assert "training.loggers=[]: Where to log beside the CSV files. [list of `tensorboard`, `wandb`]" in lines
+        assert "dataset=data/{env.name}: Folder of the dataset to train on (collect). [text]" in lines
+        assert lines[0].startswith("Train an agent on a dataset: `ocwm train agent=")
+        assert "agent=dreamer_pcp: World model and behaviours. [one of the configuration groups below]" in lines
+        assert "agent.world_model: What observes, remembers and predicts. [`flat`, `object`]" in lines
+        assert [line for line in lines if line.startswith("agent.world_model.lambda_proprio=1: Weight of")]
+        assert [line for line in lines if line.startswith("agent.behaviours.NAME.goals.share (mixed, future): Share")]
+        assert "env.options.horizon: Steps per episode. [whole number, at least 1]" in lines  # each has its own
+        assert [line for line in lines if line.startswith("env.options.objects=[cube] (cube_move, cube_lift): What")]
+        assert not [line for line in lines if "(required)" in line]
 
     def test_takes_a_file_of_ones_own(self, compose: Callable[..., Any], tmp_path: Path) -> None:
         (tmp_path / "of_ones_own.yaml").write_text(
@@ -352,6 +361,27 @@ class TestHydra:
     def test_keeps_what_it_ran_with(self, tmp_path: Path) -> None:
         keep_settings(Training(updates=3), tmp_path / "run")
         assert OmegaConf.load(tmp_path / "run" / "config.yaml") == to_dict(Training(updates=3))
+
+
+@pytest.mark.parametrize(
+    ("script", "required"),
+    [
+        ("collect", []),
+        ("evaluate", ["checkpoint"]),
+        ("diagnose", ["checkpoint", "dataset"]),
+        ("import_data", ["source"]),
+        ("export_data", ["dataset", "format", "destination"]),
+        ("share", ["evaluation"]),
+    ],
+)
+def test_help_says_what_a_command_does_and_needs(
+    script: str, required: list[str], scripts: dict[str, ModuleType]
+) -> None:
+    module = scripts[script]
+    [kind] = [one for one in kinds() if one.__module__ == module.__name__]
+    lines = help_text(module.__doc__ or "", kind, {"env": "reacher"}).splitlines()
+    assert lines[0] == plain_text((module.__doc__ or "").split("\n\n")[0])
+    assert [line.split()[0] for line in lines if " (required): " in line] == required
 
 
 def test_warnings_are_one_line_while_a_recipe_runs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -21,7 +21,8 @@ from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.files import as_file_name, seen_from
 from torchrl_ocwm.parts import load_plugins
-from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
+from torchrl_ocwm.recipes.help import help_text
+from torchrl_ocwm.settings import SettingsError, from_dict, to_dict
 
 with needs("a recipe", "recipes"):
     import hydra
@@ -57,6 +58,7 @@ def recipe(
     def decorate(function: Callable[[T], None]) -> Callable[[], None]:
         """The script's main function."""
         kind: type[T] = next(iter(get_type_hints(function).values()))
+        about = sys.modules[function.__module__].__doc__ or ""
 
         def guarded(config: DictConfig) -> None:
             with _user_errors():
@@ -67,7 +69,7 @@ def recipe(
                 store_options()
                 _check_words(sys.argv[1:])
                 _check_choices(groups or {}, sys.argv[1:])
-            ConfigStore.instance().store(name, _schema(kind, groups or {}, more))
+            ConfigStore.instance().store(name, _schema(kind, groups or {}, more, about))
             with _short_warnings(), _without(GROUPS - set(groups or {})):
                 hydra.main(version_base="1.3", config_path=None, config_name=name)(guarded)()
 
@@ -157,24 +159,6 @@ def run_folder(output: str) -> Path:
     return Path(output, as_file_name(",".join(item for key, item in given.items() if key not in shown)))
 
 
-def help_lines(kind: type, at: str = "") -> Iterator[str]:
-    """What each setting of a class is, with its default: one line each.
-
-    Examples:
-        >>> from torchrl_ocwm.training.settings import Training
-        >>> next(help_lines(Training, "training"))
-        'training.updates=10000: Updates of model, actor and critic in all.'
-    """
-    hints, docs = get_type_hints(kind), field_docs(kind)
-    for one in fields(kind):
-        name = f"{at}.{one.name}" if at else one.name
-        if is_dataclass(hints[one.name]):
-            yield from help_lines(hints[one.name], name)
-        else:
-            value = f"={_shown(one.default)}" if one.default is not MISSING else ""
-            yield f"{name}{value}: {docs.get(one.name, '')}"
-
-
 def defaults(kind: Any) -> dict[str, Any]:
     """The fields of a settings class with their defaults; ``"???"``, as Hydra has it, for what has to be given.
 
@@ -212,13 +196,13 @@ def _user_errors() -> Iterator[None]:
         sys.exit(" ".join(f"{type(error).__name__}: {error}".split()))
 
 
-def _schema(kind: type, groups: Mapping[str, str], more: Mapping[str, Any]) -> dict[str, Any]:
+def _schema(kind: type, groups: Mapping[str, str], more: Mapping[str, Any], about: str) -> dict[str, Any]:
     """The configuration of a recipe: its groups, and all other settings with their defaults."""
     plain = {name: value for name, value in defaults(kind).items() if name not in groups}
     chosen: list[Any] = [{group: choice} for group, choice in groups.items()]
     quiet = [{f"override hydra/{part}": "none"} for part in _QUIET]
-    text = "\n".join(help_lines(kind)).replace("$", "")
-    own = {"run": {"dir": "."}, "output_subdir": None, "help": {"header": f"Settings:\n{text}\n"}, **more}
+    text = help_text(about, kind, groups).replace("$", "")
+    own = {"run": {"dir": "."}, "output_subdir": None, "help": {"header": text}, **more}
     return {"defaults": [*chosen, "_self_", *quiet], **plain, "hydra": own}
 
 
@@ -274,9 +258,3 @@ def _default(one: Any) -> Any:
     if one.default is not MISSING:
         return to_dict(one.default)
     return "???" if one.default_factory is MISSING else to_dict(one.default_factory())
-
-
-def _shown(value: Any) -> str:
-    """A value as the command line takes it."""
-    plain = to_dict(value)
-    return {"None": "null", "True": "true", "False": "false"}.get(str(plain), str(plain))
