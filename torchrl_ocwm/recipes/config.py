@@ -181,7 +181,13 @@ def _short_warnings() -> Iterator[None]:
         warnings.formatwarning = before
 
 
-def _one_line(message: Warning | str, category: type[Warning], *place: Any) -> str:  # noqa: ARG001
+def _one_line(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,  # noqa: ARG001
+    lineno: int,  # noqa: ARG001
+    line: str | None = None,  # noqa: ARG001
+) -> str:
     return f"{category.__name__}: {' '.join(str(message).split())}\n"
 
 

@@ -12,7 +12,7 @@ from torchrl_ocwm.parts import Part
 from torchrl_ocwm.settings import Settings, describe, field_docs, plain_text, to_dict
 
 
-def help_text(about: str, kind: type[Settings], groups: Mapping[str, str]) -> str:
+def help_text(about: str, kind: type, groups: Mapping[str, str]) -> str:
     """What a command does, and its settings.
 
     Args:
@@ -23,7 +23,7 @@ def help_text(about: str, kind: type[Settings], groups: Mapping[str, str]) -> st
     return "\n".join([plain_text(about.split("\n\n")[0]), "", "Settings:", *help_lines(kind, groups=groups), ""])
 
 
-def help_lines(kind: type[Settings], at: str = "", groups: Mapping[str, str] | None = None) -> Iterator[str]:
+def help_lines(kind: type, at: str = "", groups: Mapping[str, str] | None = None) -> Iterator[str]:
     """What each setting of a class is, with its default and the values that it can have: one line each.
 
     Examples:
@@ -32,17 +32,17 @@ def help_lines(kind: type[Settings], at: str = "", groups: Mapping[str, str] | N
         'training.updates=10000: Updates of model, actor and critic in all. [whole number, 1 to 1,000,000,000]'
     """
     docs, hints = field_docs(kind), get_type_hints(kind)
-    for one in fields(kind):  # type: ignore[arg-type]
+    for one in fields(kind):
         name, hint = f"{at}.{one.name}" if at else one.name, hints[one.name]
         if groups and one.name in groups:
-            yield f"{name}={groups[one.name]}: {docs[one.name]} [one of the configuration groups below]"
+            yield f"{name}={groups[one.name]}: {docs.get(one.name, '')} [one of the configuration groups below]"
         elif not is_group(hint):
             required = not at and one.default is one.default_factory is MISSING
             yield _line(kind, one, name, " (required)" if required else "")
         yield from _below(kind, one.name, hint, name)
 
 
-def _below(kind: type[Settings], field: str, hint: Any, at: str) -> Iterator[str]:
+def _below(kind: type, field: str, hint: Any, at: str) -> Iterator[str]:
     """What can be set within a setting."""
     if is_group(hint):
         yield from help_lines(hint, at)
@@ -54,19 +54,19 @@ def _below(kind: type[Settings], field: str, hint: Any, at: str) -> Iterator[str
         yield from help_lines(get_args(hint)[1], f"{at}.NAME")
 
 
-def _of_one(kinds: Mapping[str, type[Settings]], at: str) -> Iterator[str]:
+def _of_one(kinds: Mapping[str, type], at: str) -> Iterator[str]:
     """The settings of parts or environments of which one is chosen, with the names of those that have it."""
     having: dict[str, dict[str, Field]] = {}
     for who, kind in kinds.items():
-        for one in fields(kind):  # type: ignore[arg-type]
+        for one in fields(kind):
             having.setdefault(one.name, {})[who] = one
-    for name, who in having.items():
-        first, one = next(iter(who.items()))
-        alike = all(other.default == one.default for other in who.values())
-        yield _line(kinds[first], one, f"{at}.{name}", f" ({', '.join(who)})" * (len(who) < len(kinds)), alike=alike)
+    for name, by in having.items():
+        first, one = next(iter(by.items()))
+        alike = all(other.default == one.default for other in by.values())
+        yield _line(kinds[first], one, f"{at}.{name}", f" ({', '.join(by)})" * (len(by) < len(kinds)), alike=alike)
 
 
-def _line(kind: type[Settings], one: Field, name: str, note: str, *, alike: bool = True) -> str:
+def _line(kind: type, one: Field, name: str, note: str, *, alike: bool = True) -> str:
     default = f"={written_out(one.default)}" if alike and one.default is not MISSING else ""
     hint = get_type_hints(kind)[one.name]
     parts = Part.registered[hint.kind] if isinstance(hint, type) and issubclass(hint, Part) else ()
@@ -74,7 +74,7 @@ def _line(kind: type[Settings], one: Field, name: str, note: str, *, alike: bool
     return f"{name}{default}{note}: {field_docs(kind).get(one.name, '')} [{choices}]"
 
 
-def values(kind: type[Settings], one: Field) -> str:
+def values(kind: type, one: Field) -> str:
     """What a setting of a class can be.
 
     Examples:
