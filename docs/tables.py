@@ -30,7 +30,7 @@ sys.path.insert(0, str(ROOT))
 from torchrl_ocwm.agents import AGENTS, SIZES  # noqa: E402
 from torchrl_ocwm.envs import ENVIRONMENTS  # noqa: E402
 from torchrl_ocwm.parts import Part  # noqa: E402
-from torchrl_ocwm.recipes.help import code, is_group, values, written_out  # noqa: E402
+from torchrl_ocwm.recipes import code, is_group, values, written_out  # noqa: E402
 from torchrl_ocwm.settings import Settings, field_docs, plain_text  # noqa: E402
 
 TABLE = re.compile(r"(<!-- begin table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
