@@ -17,13 +17,12 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, Field, fields
 from importlib import import_module
 from inspect import cleandoc
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
@@ -31,7 +30,8 @@ sys.path.insert(0, str(ROOT))
 from torchrl_ocwm.agents import AGENTS, SIZES  # noqa: E402
 from torchrl_ocwm.envs import ENVIRONMENTS  # noqa: E402
 from torchrl_ocwm.parts import Part  # noqa: E402
-from torchrl_ocwm.settings import Settings, field_docs, plain_text, to_dict  # noqa: E402
+from torchrl_ocwm.recipes import code, is_group, values, written_out  # noqa: E402
+from torchrl_ocwm.settings import Settings, field_docs, plain_text  # noqa: E402
 
 TABLE = re.compile(r"(<!-- begin table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -119,43 +119,11 @@ def rows_of(kind: type[Settings], at: str = "") -> Iterator[Sequence[str]]:
             yield code(name), default(one), values(kind, one), field_docs(kind)[one.name]
 
 
-def is_group(hint: Any) -> bool:
-    """Whether a setting is a class of settings, and no part."""
-    return isinstance(hint, type) and issubclass(hint, Settings) and not issubclass(hint, Part)
-
-
 def default(one: Field) -> str:
     """The default of a setting, as the command line takes it."""
     if one.default_factory is not MISSING:
         return value_of(one.default_factory())
     return "has to be given" if one.default is MISSING else value_of(one.default)
-
-
-def values(kind: type[Settings], one: Field) -> str:
-    """What a setting can be."""
-    low, above, high = (one.metadata.get(limit) for limit in ("at_least", "above", "at_most"))
-    words = in_words(get_type_hints(kind)[one.name])
-    if low is not None and high is not None:
-        return f"{words}, {low:,} to {high:,}"
-    limits = {"at least": low, "above": above, "at most": high}
-    return ", ".join([words, *(f"{words} {limit:,}" for words, limit in limits.items() if limit is not None)])
-
-
-def in_words(hint: Any) -> str:
-    """A type, for people."""
-    words = {int: "whole number", float: "number", bool: "`true`, `false`", str: "text", NoneType: "`null`"}
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin is Literal:
-        return ", ".join(map(code, arguments))
-    if origin in (Union, UnionType):
-        return ", ".join(map(in_words, arguments))
-    if origin is tuple:
-        return f"list of {in_words(arguments[0])}{'s' if arguments[0] in words else ''}"
-    if origin in (dict, Mapping):
-        return "names and what they stand for"
-    if isinstance(hint, type) and issubclass(hint, Part):
-        return f"name of a part ({hint.kind.replace('_', ' ')})"
-    return words[hint]
 
 
 def value_of(value: Any) -> str:
@@ -176,23 +144,9 @@ def part(value: Part) -> str:
     return f"{code(known[0])} with {changed}" if changed else code(known[0])
 
 
-def written_out(value: Any) -> str:
-    """A value as it stands on a command line."""
-    plain = to_dict(value)
-    if isinstance(plain, list):
-        return f"[{', '.join(map(written_out, plain))}]"
-    if isinstance(plain, float):
-        return f"{plain:g}"
-    return {"None": "null", "True": "true", "False": "false"}.get(str(plain), str(plain))
-
-
 def summary(kind: type) -> str:
     """The first paragraph of a docstring."""
     return plain_text(cleandoc(kind.__doc__ or "").split("\n\n")[0])
-
-
-def code(text: Any) -> str:
-    return f"`{text}`"
 
 
 if __name__ == "__main__":

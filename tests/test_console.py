@@ -77,6 +77,9 @@ def test_the_words_after_a_command_are_its_recipes(called: Callable[..., list[li
         (("play", "--help"), ["--help"]),
         (("play",), []),
         (("evaluate", "reacher/focus_lcp", "goals=9"), ["checkpoint='reacher/focus_lcp'", "goals=9"]),
+        (("diagnose", "reacher/focus_lcp", "dataset=d"), ["checkpoint='reacher/focus_lcp'", "dataset=d"]),
+        (("import", "demos.hdf5"), ["source='demos.hdf5'"]),
+        (("share", "outputs/evaluation"), ["evaluation='outputs/evaluation'"]),
         (("collect", "reacher"), ["reacher"]),
     ],
 )
@@ -141,7 +144,7 @@ def test_exit_codes_and_help_in_another_folder(ocwm: Path, tmp_path: Path) -> No
     assert (wrong.returncode, wrong.stderr) == (1, "SettingsError: steps must be at least 1, got 0\n")
     shown = run("train", "--help")
     assert shown.returncode == 0
-    assert "training.updates=10000: Updates of model, actor and critic in all." in shown.stdout.splitlines()
+    assert "\ntraining.updates=10000: Updates of model, actor and critic in all. [whole number, 1 to" in shown.stdout
 
 
 def test_help_of_which_nobody_reads_more(ocwm: Path) -> None:

@@ -25,7 +25,13 @@ COMMANDS = {
     "share": ("share", "Make a trained agent ready for others."),
 }
 #: Commands whose first word may be the value of a setting: ``ocwm play reacher/focus_lcp``.
-FIRST_WORDS = {"evaluate": "checkpoint", "play": "agent"}
+FIRST_WORDS = {
+    "evaluate": "checkpoint",
+    "diagnose": "checkpoint",
+    "play": "agent",
+    "import": "source",
+    "share": "evaluation",
+}
 _HELP, _COMPLETION = ("-h", "--help"), ("-sc", "--shell-completion")
 
 

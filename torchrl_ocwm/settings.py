@@ -175,6 +175,32 @@ def to_dict(settings: Any) -> Any:
     return {**name, **{one.name: to_dict(getattr(settings, one.name)) for one in fields(settings)}}
 
 
+def flat(values: Mapping[str, Any], at: str = "") -> dict[str, Any]:
+    """A nested mapping with dotted names.
+
+    Examples:
+        >>> flat({"a": {"b": 1, "c": [2]}})
+        {'a.b': 1, 'a.c': [2]}
+    """
+    leaves: dict[str, Any] = {}
+    for name, value in values.items():
+        leaves.update(flat(value, f"{at}{name}.") if isinstance(value, Mapping) else {at + name: value})
+    return leaves
+
+
+def differences(one: Any, other: Any, of_one: str, of_other: str) -> str:
+    """What differs between two settings, or mappings of settings, by dotted names and in words.
+
+    Examples:
+        >>> from torchrl_ocwm.envs import Workspace
+        >>> differences(Workspace((0.0,), (1.0,)), Workspace((0.0,), (2.0,)), "there", "here")
+        'high: [1.0] there, [2.0] here'
+    """
+    left, right = flat(to_dict(one)), flat(to_dict(other))
+    names = [name for name in dict.fromkeys([*right, *left]) if left.get(name) != right.get(name)]
+    return "; ".join(f"{name}: {left.get(name)} {of_one}, {right.get(name)} {of_other}" for name in names)
+
+
 def change(settings: T, changes: Mapping[str, Any]) -> T:
     """A copy of settings with some of them changed, by dotted names.
 

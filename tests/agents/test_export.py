@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_ocwm.agents import Policy, build_agent, export_policy, policy_inputs, policy_outputs
+from torchrl_ocwm.envs import ActionRange, Task
 from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.testing import random_records, reacher_task
@@ -20,10 +22,10 @@ STEPS = 20
 Step = Callable[[dict[str, Tensor]], list[Tensor]]
 
 
-def sure(row: str) -> Policy:
+def sure(row: str, task: Task | None = None) -> Policy:
     """A policy that draws no lots: each class of its latent has the probability 0 or 1."""
     torch.manual_seed(0)
-    policy = build_agent(row, reacher_task(), "debug").policy()
+    policy = build_agent(row, task or reacher_task(), "debug").policy()
     posterior = policy.agent.model.posterior
     posterior.unimix = 0.0
     with torch.no_grad():
@@ -69,6 +71,23 @@ def test_an_exported_policy_acts_as_the_policy(row: str, suffix: str, load: Call
         carried, memory = there["latent"], {name: here[f"next_{name}"] for name in memory}
         actions.append(there["action"])
     assert torch.stack(actions).std(0).min() > 0.05
+
+
+def test_a_file_gives_what_the_robot_takes(tmp_path: Path) -> None:
+    """From images that are not square: joint targets in its own units, or the number of a choice."""
+    plain, joints = reacher_task((32, 64)), ActionRange(low=(10.0, -4.0), high=(20.0, -2.0))
+    for kind, task in {"range": replace(plain, action_range=joints), "choice": replace(plain, discrete=True)}.items():
+        policy = sure("dreamer_pcp", task)
+        inputs = policy_inputs(policy)
+        assert inputs["pixels"].shape == (3, 32, 64)
+        returned = through_torch(export_policy(policy, tmp_path / f"{kind}.pt2"))(inputs)
+        outputs = dict(zip(policy_outputs(policy), returned, strict=True))
+        remembered = outputs["next_latent_action"]
+        assert remembered.abs().max() <= 1
+        if kind == "range":
+            torch.testing.assert_close(outputs["action"], joints.to_robot(remembered))
+        else:
+            assert (outputs["action"].dtype, outputs["action"].item()) == (torch.int64, remembered.argmax().item())
 
 
 def test_another_kind_of_file(tmp_path: Path) -> None:

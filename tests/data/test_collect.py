@@ -254,7 +254,7 @@ def test_checkpoint_as_policy(tmp_path):
     assert dataset.metadata["policies"] == {str(checkpoint): 1}
     assert dataset.records["action"][1:].std() > 0
     other = {**OPTIONS, "virtual_target": 4}
-    message = r"checkpoint\.zip: the agent was trained for 'reacher' with options \{.*not for"
+    message = r"checkpoint\.zip: the agent was trained for another task \(options.virtual_target: None there, 4 here\)"
     with pytest.raises(ValueError, match=message):
         gather(tmp_path / "other", 20, policy=checkpoint, options=other)
 

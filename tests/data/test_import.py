@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,8 @@ from torchrl_ocwm.data import (
     export_dataset,
     import_dataset,
 )
-from torchrl_ocwm.envs import ActionRange, Workspace
+from torchrl_ocwm.data.convert import no_workspace
+from torchrl_ocwm.envs import ActionRange
 from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.settings import SettingsError, change
 from torchrl_ocwm.testing import random_dataset, reacher_task
@@ -195,7 +197,6 @@ def test_lerobot_version_2_in_its_documented_layout(tmp_path: Path) -> None:
         import_dataset(tmp_path / "arm", tmp_path / "other")
 
 
-@pytest.mark.filterwarnings("ignore")  # Minari asks for authors and code
 @pytest.mark.parametrize(
     ("kind", "destination", "module"),
     [("npz", "out", "numpy"), ("hdf5", "out/demos.hdf5", "h5py"), ("minari", "my_arm/test-v0", "minari")],
@@ -211,7 +212,9 @@ def test_what_is_exported_can_be_imported_again(
     changes = {"plain": {}, "range": {"action_range": joints}, "discrete": {"discrete": True}}[actions]
     task = change(reacher_task((10, 40)), changes)
     dataset = random_dataset(tmp_path / "data", task, episodes=2, length=5)
-    export_dataset(dataset, destination, kind)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # Minari asks for authors and code
+        export_dataset(dataset, destination, kind)
     ends = {"action_low": joints.low, "action_high": joints.high} if actions == "range" else {}
     box = {"low": task.workspace.low, "high": task.workspace.high}
     settings = Importing(
@@ -224,9 +227,18 @@ def test_what_is_exported_can_be_imported_again(
             torch.testing.assert_close(dataset[1][key][1:], again[1][key][1:])
         else:
             torch.testing.assert_close(dataset.records[key], again.records[key], msg=str(key))
-    if kind != "minari":
-        with pytest.raises(DatasetError, match="is there already"):
-            export_dataset(dataset, destination, kind)
+    with pytest.raises(DatasetError, match="is there already"):
+        export_dataset(dataset, destination, kind)
+
+
+@pytest.mark.parametrize("name", ["demos", "my_arm/demos", "my arm/demos-v0", "demos-v", ""])
+def test_a_minari_dataset_has_a_version(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    dataset = random_dataset(tmp_path / "data", reacher_task(16))
+    with pytest.raises(DatasetError, match=f"{name!r} is no id of a Minari dataset; .* as in demos-v0"):
+        export_dataset(dataset, name, "minari")
+    assert not (tmp_path / "minari").exists()
 
 
 def test_only_lerobots_own_library_writes_its_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -292,6 +304,10 @@ def test_positions_become_metres_from_the_start(tmp_path: Path) -> None:
     seen = np.delete(metres, [2, 3], 0)
     np.testing.assert_allclose(dataset.task.workspace.low, seen.min(0), atol=1e-5)
     np.testing.assert_allclose(dataset.task.workspace.high, seen.max(0), atol=1e-5)
+    (tmp_path / "npz" / "episode_0.npz").unlink()
+    hidden = npz(tmp_path / "npz", {**arrays, "object_position": np.full_like(metres, np.nan)})
+    with pytest.raises(SourceError, match="object is hidden in all frames; give low and high"):
+        import_dataset(hidden, tmp_path / "hidden")
 
 
 def test_images_are_scaled_and_cameras_put_side_by_side(tmp_path: Path) -> None:
@@ -387,8 +403,14 @@ def test_places_that_hold_nothing_or_something_else(tmp_path: Path) -> None:
     pytest.importorskip("h5py")
     with pytest.raises(SourceError, match=r"bad\.h5: cannot be read as HDF5"):
         import_dataset(tmp_path / "bad.h5", tmp_path / "other")
+    for name in ("none.hdf5", "none.h5"):
+        with pytest.raises(SourceError, match=rf"{name}: no such file or folder$"):
+            import_dataset(tmp_path / name, tmp_path / "other")
+    for kind in ("npz", "lerobot", "hdf5"):
+        with pytest.raises(SourceError, match="nowhere: no such file or folder$"):
+            import_dataset(tmp_path / "nowhere", tmp_path / "other", Importing(format=kind))
     pytest.importorskip("minari")
-    with pytest.raises(SourceError, match="no Minari dataset on this machine"):
+    with pytest.raises(SourceError, match="no such file or folder, and no Minari dataset on this machine"):
         import_dataset("nobody/knows-v0", tmp_path / "other")
 
 
@@ -398,7 +420,7 @@ def test_what_is_missing_is_said_once_with_the_agents_that_it_rules_out(tmp_path
     (tmp_path / "npz" / "episode_0.npz").unlink()
     arrays = {key: value for key, value in episode().items() if key not in ("object_position", "reward")}
     dataset = import_dataset(npz(tmp_path / "npz", arrays), tmp_path / "bare")
-    assert (dataset.task.workspace, dataset.task.workspace.dim) == (Workspace(low=(-1.0, -1.0), high=(1.0, 1.0)), 2)
+    assert dataset.task.workspace == no_workspace()  # transform_dataset fits one to positions that come later
     said = ruled_out(dataset)
     assert said is not None
     assert "lacks object_position (for all agents), masks (for focus, focus_pcp, focus_lcp, focus_explore). " in said

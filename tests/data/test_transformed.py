@@ -1,6 +1,8 @@
 """Datasets through a transform."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -8,7 +10,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import Compose, Transform
 
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, transform_dataset
-from torchrl_ocwm.envs import ColourMasks, MaskToPosition
+from torchrl_ocwm.data.convert import no_workspace
+from torchrl_ocwm.envs import ColourMasks, MaskToPosition, Workspace
 from torchrl_ocwm.testing import random_dataset, reacher_task
 
 TASK = reacher_task(16)
@@ -78,6 +81,67 @@ def test_recordings_without_masks_get_some(tmp_path: Path) -> None:
     steps = torch.arange(6)
     expected = torch.stack([0.01 * (3.5 + steps - 8), torch.full((6,), 0.03)], -1)
     assert torch.allclose(copy[1]["next", "object_position"][:, 0], expected, atol=1e-6)
+
+
+class Positioned(Transform):
+    """Puts the object at the same places ``[T, D]`` in each episode; hidden where the place means nothing."""
+
+    def __init__(self, places: list[list[float]], hidden: tuple[int, ...] = (-1,)) -> None:
+        super().__init__()
+        self.places, self.hidden = torch.tensor(places), list(hidden)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        visible = torch.ones(len(tensordict), 1, dtype=torch.bool)
+        visible[self.hidden] = False
+        tensordict["next", "object_position"], tensordict["next", "object_visible"] = self.places[:, None], visible
+        return tensordict
+
+
+def unpositioned(path: Path, workspace: Workspace | None = None) -> EpisodeDataset:
+    """Recordings as they are imported without positions."""
+    left_out = [("next", name) for name in ("object_position", "object_visible", "goal_position", "reward")]
+    plain = random_dataset(path / "plain", TASK, episodes=2, length=3)
+    task = replace(TASK, workspace=workspace or no_workspace()).to_dict()
+    metadata: dict[str, Any] = {"environment": TASK.name, "options": plain.metadata["options"], "task": task}
+    example = plain[0].exclude(*left_out)[0]
+    with EpisodeDataset.create(path / "unpositioned", example=example, metadata=metadata) as recorded:
+        for episode in range(2):
+            recorded.append(plain[episode].exclude(*left_out))
+    return EpisodeDataset.open(recorded.path)
+
+
+@pytest.mark.parametrize(
+    ("places", "low", "high"),
+    [
+        ([[-0.2, 0.1], [0.2, 0.3], [0.9, 0.9]], (-0.2, 0.1), (0.2, 0.3)),
+        ([[-0.2, 0.1, 0.5], [0.2, 0.3, 0.5], [0.9, 0.9, 0.9]], (-0.2, 0.1, 0.49), (0.2, 0.3, 0.51)),
+    ],
+)
+def test_positions_that_are_added_bring_their_workspace(
+    places: list[list[float]], low: tuple[float, ...], high: tuple[float, ...], tmp_path: Path
+) -> None:
+    """Of as many axes; what is hidden has no say."""
+    copy = transform_dataset(unpositioned(tmp_path), tmp_path / "copy", Positioned(places))
+    for task in (copy.task, EpisodeDataset.open(tmp_path / "copy", verify=True).task):
+        assert task.workspace.low == pytest.approx(low)
+        assert task.workspace.high == pytest.approx(high)
+    assert copy.records["next", "object_position"].shape == (6, 1, len(low))
+
+
+def test_a_workspace_that_is_known_or_given_stays(tmp_path: Path) -> None:
+    given, places = Workspace((0.0, 0.0), (0.3, 0.3)), Positioned([[0.1, 0.1], [0.2, 0.2], [0.2, 0.2]])
+    known = unpositioned(tmp_path, workspace=Workspace((-0.5, -0.5), (0.5, 0.5)))
+    assert transform_dataset(known, tmp_path / "kept", places).task == known.task
+    assert transform_dataset(known, tmp_path / "given", places, workspace=given).task.workspace == given
+    with pytest.raises(DatasetError, match=r"shape \(1, 3\) per record, the task says \(1, 2\) \(2 axes, as its work"):
+        transform_dataset(known, tmp_path / "deep", Positioned([[0.1, 0.1, 0.1]] * 3))
+
+
+def test_an_object_that_is_seen_nowhere_gives_no_workspace(tmp_path: Path) -> None:
+    nowhere = Positioned([[0.0, 0.0]] * 3, hidden=(0, 1, 2))
+    with pytest.warns(UserWarning, match="the first object is visible in no frame, so that its workspace is unknown"):
+        copy = transform_dataset(unpositioned(tmp_path), tmp_path / "copy", nowhere)
+    assert copy.task.workspace == no_workspace()
 
 
 def test_what_comes_out_must_be_as_the_contract_says(tmp_path: Path) -> None:

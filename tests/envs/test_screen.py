@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -45,13 +46,21 @@ def test_a_picture_of_any_size(make: Callable[..., Reacher], size: int) -> None:
     assert not np.array_equal(before, env.render())
 
 
+def test_a_picture_that_is_not_square_shows_more_at_its_sides(make: Callable[..., Reacher]) -> None:
+    wide, square = (make(render_mode="rgb_array", render_size=size).render() for size in ((48, 80), 48))
+    assert wide is not None
+    assert wide.shape == (48, 80, 3)
+    assert np.abs(wide[:, 16:64].astype(float) - square).mean() < 1
+
+
 def test_without_a_mode_there_is_nothing_to_see(make: Callable[..., Reacher]) -> None:
     assert make(render_size=40).render() is None
 
 
 def test_a_size_that_there_is_not(make: Callable[..., Reacher]) -> None:
-    with pytest.raises(ValueError, match="render_size must be at least 1, got 0"):
-        make(render_mode="rgb_array", render_size=0)
+    for size in (0, (48, 0)):
+        with pytest.raises(ValueError, match=rf"render_size must be at least 1, got {re.escape(str(size))}"):
+            make(render_mode="rgb_array", render_size=size)
 
 
 @pytest.mark.filterwarnings("ignore:.*natively support.*")

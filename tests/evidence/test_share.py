@@ -138,6 +138,15 @@ def test_what_is_missing_of_them(plain: Path, tmp_path: Path) -> None:
         share(plain, tmp_path / "shared")
 
 
+def test_an_agent_that_others_have(plain: Path, tmp_path: Path) -> None:
+    report = Report(torch.zeros(1, 2), {"goals": 1, "episode_steps": 7})
+    report.add("random", {"final_score": torch.tensor([0.25])}, source="smooth actions")
+    report.add("focus_lcp", {"final_score": torch.tensor([0.75])}, source="reacher/focus_lcp")
+    report.save(plain)
+    with pytest.raises(RecordError, match="is of reacher/focus_lcp, which others have by that name; there is no check"):
+        share(plain, tmp_path / "shared")
+
+
 def test_the_recipe(evaluated: Path, tmp_path: Path, command: Callable[..., str]) -> None:
     assert str(tmp_path / "new") in command("share", f"evaluation={evaluated}", f"output={tmp_path}/new", "name=a/b")
     assert "# a/b" in (tmp_path / "new" / "README.md").read_text()

@@ -62,13 +62,19 @@ def is_running(pid: int) -> bool:
     return bool(state) and not state.startswith("Z")
 
 
+def catches(pid: int, number: signal.Signals) -> bool:
+    """Whether a process does something of its own at a signal."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    caught = next(line for line in status.splitlines() if line.startswith("SigCgt"))
+    return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
+
+
 def is_at_work(process: subprocess.Popen[str], workers: int) -> bool:
-    """All of it is past the start, which takes two or three seconds of processor time."""
+    """The recipe has begun, and its workers are past the start, which takes two or three seconds of processor time."""
     assert process.poll() is None, process.communicate()
-    started = [process.pid, *children(process.pid)]
     with suppress(FileNotFoundError):
-        seconds = [int(Path(f"/proc/{pid}/stat").read_text().split()[13]) / 100 for pid in started]
-        return sum(used > 4 for used in seconds) > workers
+        stats = [Path(f"/proc/{pid}/stat").read_text().split() for pid in children(process.pid)]
+        return catches(process.pid, signal.SIGTERM) and sum(int(one[13]) > 400 for one in stats) >= workers
     return False
 
 

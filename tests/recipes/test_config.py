@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, fields
 from itertools import cycle
@@ -29,7 +30,9 @@ from torchrl_ocwm.agents import (
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.provenance import commit, machine
 from torchrl_ocwm.recipes import keep_settings
-from torchrl_ocwm.settings import Settings, change, field_docs, to_dict
+from torchrl_ocwm.recipes.config import recipe
+from torchrl_ocwm.recipes.help import help_text
+from torchrl_ocwm.settings import Settings, change, field_docs, plain_text, to_dict
 from torchrl_ocwm.testing import random_dataset, reacher_task
 from torchrl_ocwm.training.settings import Training
 
@@ -306,9 +309,17 @@ class TestHydra:
         script = str(EXAMPLES / "train_offline.py")
         done = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True, check=True)
         lines = done.stdout.splitlines()
-        assert "training.updates=10000: Updates of model, actor and critic in all." in lines
-        assert "training.loggers=[]: Where to log beside the CSV files." in lines
-        assert "dataset=data/{env.name}: Folder of the dataset to train on (collect)." in lines
+        assert [line for line in lines if line.startswith("training.updates=10000: Updates of model, actor and critic")]
+        assert "training.loggers=[]: Where to log beside the CSV files. [list of `tensorboard`, `wandb`]" in lines
+        assert "dataset=data/{env.name}: Folder of the dataset to train on (collect). [text]" in lines
+        assert lines[0].startswith("Train an agent on a dataset: `ocwm train agent=")
+        assert "agent=dreamer_pcp: World model and behaviours. [one of the configuration groups below]" in lines
+        assert "agent.world_model: What observes, remembers and predicts. [`flat`, `object`]" in lines
+        assert [line for line in lines if line.startswith("agent.world_model.lambda_proprio=1: Weight of")]
+        assert [line for line in lines if line.startswith("agent.behaviours.NAME.goals.share (mixed, future): Share")]
+        assert "env.options.horizon: Steps per episode. [whole number, at least 1]" in lines  # each has its own
+        assert [line for line in lines if line.startswith("env.options.objects=[cube] (cube_move, cube_lift): What")]
+        assert not [line for line in lines if "(required)" in line]
 
     def test_takes_a_file_of_ones_own(self, compose: Callable[..., Any], tmp_path: Path) -> None:
         (tmp_path / "of_ones_own.yaml").write_text(
@@ -354,6 +365,42 @@ class TestHydra:
         assert OmegaConf.load(tmp_path / "run" / "config.yaml") == to_dict(Training(updates=3))
         made = json.loads((tmp_path / "run" / "made.json").read_text())
         assert made == {"commit": commit(), "machine": machine()}
+
+
+@pytest.mark.parametrize(
+    ("script", "required"),
+    [
+        ("collect", []),
+        ("evaluate", ["checkpoint"]),
+        ("diagnose", ["checkpoint", "dataset"]),
+        ("import_data", ["source"]),
+        ("export_data", ["dataset", "format", "destination"]),
+        ("share", ["evaluation"]),
+    ],
+)
+def test_help_says_what_a_command_does_and_needs(
+    script: str, required: list[str], scripts: dict[str, ModuleType]
+) -> None:
+    module = scripts[script]
+    [kind] = [one for one in kinds() if one.__module__ == module.__name__]
+    lines = help_text(module.__doc__ or "", kind, {"env": "reacher"}).splitlines()
+    assert lines[0] == plain_text((module.__doc__ or "").split("\n\n")[0])
+    assert [line.split()[0] for line in lines if " (required): " in line] == required
+
+
+def test_warnings_are_one_line_while_a_recipe_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python shows a warning with what ``warnings.formatwarning`` makes of it."""
+    seen: list[str] = []
+
+    @recipe("warns")
+    def main(config: Training) -> None:
+        seen.append(warnings.formatwarning("images are\n  dark", UserWarning, "file.py", 3))
+
+    before = warnings.formatwarning
+    monkeypatch.setattr(sys, "argv", ["ocwm"])
+    main()
+    assert seen == ["UserWarning: images are dark\n"]
+    assert warnings.formatwarning is before
 
 
 def test_groups_that_a_recipe_does_not_take_are_plain_settings_in_it(compose: Callable[..., Any]) -> None:

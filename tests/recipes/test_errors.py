@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from torchrl_ocwm.agents import build_agent, save_agent
-from torchrl_ocwm.data import CollectionError, SourceError
+from torchrl_ocwm.data import CollectionError, EpisodeDataset, SourceError
 from torchrl_ocwm.data.dataset import DatasetError
 from torchrl_ocwm.devices import DeviceError
-from torchrl_ocwm.envs import registry
+from torchrl_ocwm.envs import Task, registry
 from torchrl_ocwm.envs.calibration import CalibrationError
 from torchrl_ocwm.envs.missing import SystemLibraryError
 from torchrl_ocwm.envs.opengl import RenderingError
@@ -74,6 +74,15 @@ def test_a_missing_package_has_its_name() -> None:
     assert MissingPackageError("x", name="mujoco").name == "mujoco"
 
 
+def unpositioned(path: Path, task: Task) -> EpisodeDataset:
+    whole = random_dataset(path / "whole", task, episodes=1)
+    records = whole[0].exclude(("next", "object_position"))
+    metadata = {"environment": task.name, "options": {}, "task": task.to_dict()}
+    with EpisodeDataset.create(path / "bare", example=records[0], metadata=metadata) as dataset:
+        dataset.append(records)
+    return dataset
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """What commands are given."""
@@ -86,6 +95,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         small=random_dataset(folder / "small", reacher_task(image_size=32), episodes=1).path,
         agent=save_agent(build_agent("dreamer_pcp", task, "debug"), folder / "agent.zip"),
         other=save_agent(build_agent("dreamer_pcp", reacher_task(image_size=32), "debug"), folder / "other.zip"),
+        recorded=save_agent(build_agent("dreamer_pcp", replace(task, name="my_arm"), "debug"), folder / "recorded.zip"),
+        bare=unpositioned(folder / "bare", task).path,
         results=folder / "results.json",
     )
 
@@ -94,10 +105,35 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     ("script", "arguments", "message"),
     [
         ("collect", "policy=rnd", "SettingsError: policy must be random, scripted or a trained agent (rnd: no such"),
-        ("collect", "policy={other} dataset=d", "SettingsError: policy={other}: the agent was trained for 'reacher'"),
+        (
+            "collect",
+            "policy={other} dataset=d",
+            "SettingsError: policy={other}: the agent was trained for another task (",
+        ),
         ("collect", "dataset={data}", "DatasetError: {data}: holds a dataset of 'reacher' with options {{}}, not of"),
         ("collect", "dataset={results} env.options.horizon=2", "DatasetError: {results}: cannot"),
-        ("train_offline", "dataset=/nowhere", "DatasetError: /nowhere/dataset.json: no such file"),
+        (
+            "train_offline",
+            "",
+            "DatasetError: data/reacher/dataset.json: no such file; data/reacher holds no dataset of torchrl_ocwm; "
+            "`ocwm collect env=reacher` makes one",
+        ),
+        (
+            "train_offline",
+            "dataset=/nowhere",
+            "DatasetError: /nowhere/dataset.json: no such file; /nowhere holds no dataset of torchrl_ocwm; `ocwm "
+            "collect env=reacher dataset=/nowhere` makes one",
+        ),
+        (
+            "train_offline",
+            "env.name=my_arm",
+            "DatasetError: data/my_arm/dataset.json: no such file; data/my_arm holds no dataset of torchrl_ocwm$",
+        ),
+        (
+            "train_offline",
+            "dataset={bare}",
+            "DatasetError: {bare}: holds no next/object_position, which this agent learns from. positions come",
+        ),
         ("train_offline", "dataset={data} env=cube_move", "DatasetError: {data}: holds reacher, not env=cube_move"),
         ("train_offline", "dataset={data} training.device=cuda:99", "DeviceError: device 'cuda:99' cannot be used ("),
         (
@@ -147,8 +183,25 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         ("evaluate", "checkpoint={results}", "CheckpointError: {results}: not a checkpoint of TorchRL, or damaged"),
         ("evaluate", "checkpoint={agent} include=[{results}]", "ReportError: {results}: not the results.json of"),
         ("evaluate", "checkpoint=[{agent},{agent}]", "SettingsError: {agent}: the same run as {agent}, which counts"),
-        ("evaluate", "checkpoint=[{agent},{other}]", "SettingsError: {other} is about the 'finger' of Task(name="),
-        ("diagnose", "checkpoint={agent} dataset={small}", "DatasetError: {small}: holds Task(name='reacher', image_"),
+        (
+            "evaluate",
+            "checkpoint=[{agent},{other}]",
+            "SettingsError: {other} is about something else than {agent} (image_size: 32 there, 64 here); evaluate",
+        ),
+        (
+            "evaluate",
+            "checkpoint={recorded}",
+            "SettingsError: no environment 'my_arm' is registered, only recordings are there, so that its agents "
+            "cannot be played: `ocwm diagnose` examines them on the recordings",
+        ),
+        ("play", "agent={recorded}", "SettingsError: no environment 'my_arm' is registered, only recordings are there"),
+        ("evaluate", "checkpoint=a b", "SettingsError: 'b' was not understood; settings are given as NAME=VALUE"),
+        (
+            "diagnose",
+            "checkpoint={agent} dataset={small}",
+            "DatasetError: {small}: is of another task than the agent in {agent} (image_size: 32 in the dataset, 64 in "
+            "that of the agent)$",
+        ),
         ("diagnose", "checkpoint={agent} dataset={data} device=tpu", "DeviceError: device 'tpu' cannot be used"),
         ("diagnose", "checkpoint={agent} dataset={data}", "DatasetError: {data}: cannot cut sequences of 50 frames"),
     ],
@@ -158,7 +211,7 @@ def test_one_line(
 ) -> None:
     given = arguments.format(**vars(files)).split()
     said = command(script, *(QUIET if script == "train_offline" else ()), *given)
-    assert said.startswith(message.format(**vars(files)))
+    assert f"{said}$".startswith(message.format(**vars(files)))
     assert "\n" not in said
 
 

@@ -64,7 +64,7 @@ def test_what_is_missing_is_said_once(command: Command) -> None:
     ("arguments", "message"),
     [
         (["source=recorded"], "SourceError: recorded: say what keys.pixels and keys.proprio and keys.action are"),
-        (["source=nowhere", "format=npz"], "SourceError: nowhere: holds no episodes"),
+        (["source=nowhere", "format=npz"], "SourceError: nowhere: no such file or folder"),
         (["source=recorded", "keys.pixel=top"], "pixel"),
         (["source=recorded", "metres=0"], "SettingsError: metres must be above 0, got 0.0"),
         (["source=recorded", "format=zip"], "SettingsError: format must be one of 'hdf5', 'npz', 'minari', 'lerobot'"),

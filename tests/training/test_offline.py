@@ -535,7 +535,9 @@ class TestBadInput:
 
     def test_dataset_of_another_task(self, tmp_path: Path) -> None:
         other = random_dataset(tmp_path / "data", reacher_task(32))
-        with pytest.raises(DatasetError, match="but the agent was built for"):
+        with pytest.raises(
+            DatasetError, match=r"of another task than the agent \(image_size: 32 in the dataset, 64 in"
+        ):
             train(fresh(), other, tmp_path / "run")
 
     def test_sequences_longer_than_episodes(self, dataset: EpisodeDataset, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from torchrl_ocwm import __version__
 from torchrl_ocwm.agents.agent import Agent, Policy
 from torchrl_ocwm.agents.archive import Archive, read_manifest
 from torchrl_ocwm.agents.config import AgentConfig, Size
-from torchrl_ocwm.agents.presets import flat
 from torchrl_ocwm.agents.sources import agent_file
 from torchrl_ocwm.agents.weights import AgentWeights
 from torchrl_ocwm.data.policies import POLICIES
@@ -23,7 +22,7 @@ from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs.registry import make_task
 from torchrl_ocwm.envs.task import Task
 from torchrl_ocwm.parts import VARIABLE, absent, foreign
-from torchrl_ocwm.settings import Settings, SettingsError, from_dict, to_dict
+from torchrl_ocwm.settings import Settings, SettingsError, differences, from_dict, to_dict
 
 
 def save_agent(agent: Agent, path: str | Path) -> Path:
@@ -106,8 +105,8 @@ def collecting_policy(
     policy, task = load_agent(settings.policy, behaviour=settings.behaviour), make_task(environment, **(options or {}))
     if policy.agent.task != task:
         raise SettingsError(
-            f"policy={settings.policy}: the agent was trained for {policy.agent.task.name!r} with options "
-            f"{policy.agent.task.options}, not for {task.name!r} with {task.options}"
+            f"policy={settings.policy}: the agent was trained for another task "
+            f"({differences(policy.agent.task, task, 'there', 'here')})"
         )
     return policy
 
@@ -204,10 +203,6 @@ def check_same_agent(agent: Agent, path: Path) -> None:
     Raises:
         CheckpointError: with what differs.
     """
-    there, here = (flat(to_dict(parts)) for parts in (read_parts(read_description(path)), read_parts(describe(agent))))
-    names = [name for name in dict.fromkeys([*here, *there]) if name != "release"]
-    differences = [
-        f"{name}: {there.get(name)} there, {here.get(name)} here" for name in names if there.get(name) != here.get(name)
-    ]
-    if differences:
-        raise CheckpointError(f"{path}: a checkpoint of another agent ({'; '.join(differences)})")
+    there, here = read_parts(read_description(path)), read_parts(describe(agent))
+    if different := differences(replace(there, release=here.release), here, "there", "here"):
+        raise CheckpointError(f"{path}: a checkpoint of another agent ({different})")

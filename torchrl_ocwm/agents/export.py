@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -37,7 +38,7 @@ def policy_inputs(policy: Policy) -> dict[str, Tensor]:
     latent = {"latent_state": model.state, "latent_belief": model.belief, "latent_action": model.action}
     return {
         "is_init": torch.ones(1, dtype=torch.bool),
-        "pixels": torch.zeros(3, task.image_size, task.image_size, dtype=torch.uint8),
+        "pixels": torch.zeros(3, *task.image_shape, dtype=torch.uint8),
         **seen,
         **{name: torch.zeros(size) for name, size in latent.items()},
     }
@@ -53,13 +54,15 @@ def policy_outputs(policy: Policy) -> list[str]:
         >>> "action" in names, "next_latent_belief" in names
         (True, True)
     """
-    return [key if isinstance(key, str) else "_".join(("next", *key)) for key in policy.out_keys]
+    return [key if isinstance(key, str) else "_".join(("next", *key)) for key in _for_robot(policy).out_keys]
 
 
 def export_policy(policy: Policy, file: str | Path) -> Path:
     """Write a policy to a file that needs nothing of this package, with its memory as inputs and outputs.
 
-    Its actions are the mean of the actor. Goals are positions.
+    Its actions are the mean of the actor, as the robot takes them (:meth:`~torchrl_ocwm.envs.Task.to_robot`): in its
+    own units where the task has an ``action_range``, −1 to 1 where it has none, a number where they are discrete.
+    Positions and goals are metres from the start position.
 
     Args:
         policy: The policy, on the CPU.
@@ -79,7 +82,7 @@ def export_policy(policy: Policy, file: str | Path) -> Path:
         raise SettingsError("only policies that take goals as positions can be exported; this one takes images")
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what others will change some day
-        program = torch.export.export(policy.eval(), (), policy_inputs(policy), strict=False)
+        program = torch.export.export(_for_robot(policy).eval(), (), policy_inputs(policy), strict=False)
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as new:
             if file.suffix == ".pt2":
@@ -87,6 +90,12 @@ def export_policy(policy: Policy, file: str | Path) -> Path:
             else:
                 _save_onnx(program, policy_outputs(policy), new)
     return file
+
+
+def _for_robot(policy: Policy) -> Policy:
+    """The policy with actions as the robot takes them; what it remembers of them stays as it was."""
+    convert = TensorDictModule(policy.agent.task.to_robot, ["action"], ["action"])
+    return Policy(policy.agent, policy.behaviour, *policy.module, convert)
 
 
 def _save_onnx(program: Any, outputs: list[str], file: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from torchrl_ocwm.agents.config import EXPLORE, REACH, AgentConfig, Behaviour, Learning, Size
@@ -14,7 +13,7 @@ from torchrl_ocwm.agents.rewards import FullLatentCosine, LatentChord, PositionD
 from torchrl_ocwm.agents.world_models import Flat, ObjectCentric
 from torchrl_ocwm.modules.architecture import Architecture
 from torchrl_ocwm.modules.world_model import VectorName
-from torchrl_ocwm.settings import to_dict
+from torchrl_ocwm.settings import flat, to_dict
 
 _WITH_GOAL: tuple[VectorName, ...] = ("proprio", "object_position", "goal_position")
 _PCP = Behaviour(goal=Position(), reward=PositionDistance(), goals=UniformGoalSource())
@@ -113,19 +112,6 @@ def agent_name(config: AgentConfig) -> str:
     nearest = min(differences, key=lambda name: len(differences[name]))
     changed = ", ".join(f"{key}={value}" for key, value in differences[nearest].items())
     return f"{nearest} ({changed})" if changed else nearest
-
-
-def flat(values: Mapping[str, Any], at: str = "") -> dict[str, Any]:
-    """A nested mapping with dotted names.
-
-    Examples:
-        >>> flat({"a": {"b": 1, "c": [2]}})
-        {'a.b': 1, 'a.c': [2]}
-    """
-    leaves: dict[str, Any] = {}
-    for name, value in values.items():
-        leaves.update(flat(value, f"{at}{name}.") if isinstance(value, Mapping) else {at + name: value})
-    return leaves
 
 
 def _difference(here: dict[str, Any], there: dict[str, Any]) -> dict[str, Any]:

@@ -24,6 +24,16 @@ def shipped_agents() -> list[str]:
     return sorted(file.parent.relative_to(_SHIPPED).as_posix() for file in _SHIPPED.glob(f"*/*/{AGENT_FILE}"))
 
 
+def is_name(source: str | Path) -> bool:
+    """Whether it names a trained agent that others have too: of this package, or on the Hugging Face Hub.
+
+    Examples:
+        >>> is_name("hf://owner/name"), is_name("outputs/checkpoint.zip")
+        (True, False)
+    """
+    return str(source).startswith(_HUB) or str(source) in shipped_agents()
+
+
 def agent_file(source: str | Path) -> Path:
     """The file of a trained agent.
 

@@ -143,7 +143,8 @@ def _check_shape(name: str, shape: torch.Size, expected: list[int]) -> None:
         return
     if len(expected) == 3 and [*shape] == [*expected[1:], expected[0]]:
         raise DatasetError(f"{name}: has shape {(*shape,)}, channels last; the contract is {(*expected,)}, permute it")
-    raise DatasetError(f"{name}: has shape {(*shape,)} per record, the task says {(*expected,)}")
+    axes = f" ({expected[-1]} axes, as its workspace has)" if name.endswith(_POSITIONS) else ""
+    raise DatasetError(f"{name}: has shape {(*shape,)} per record, the task says {(*expected,)}{axes}")
 
 
 def _one_hot(name: str, choice: Tensor, actions: int) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
 from torchrl_ocwm.data.formats import SourceError
+from torchrl_ocwm.envs.workspace import Workspace
 
 
 def images(array: np.ndarray, size: tuple[int, int] | None) -> Tensor:
@@ -76,6 +77,33 @@ def masks(arrays: Sequence[np.ndarray], objects: int, camera: tuple[int, int], s
         raise SourceError(f"masks have shape {(*there.shape,)}; expected one for each of {objects} objects")
     scaled = interpolate(there.float(), camera, mode="nearest-exact") > 0
     return pad(scaled, (0, shape[1] - camera[1], 0, shape[0] - camera[0]))
+
+
+def box(values: Tensor, *, least: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Lower and upper corner of the smallest box around values ``[N, D]``, no side shorter than ``2 * least``.
+
+    Examples:
+        >>> box(torch.tensor([[1.0, 0.0], [3.0, 0.0]]), least=0.5)
+        ((1.0, -0.5), (3.0, 0.5))
+    """
+    middle, half = (values.amax(0) + values.amin(0)) / 2, (values.amax(0) - values.amin(0)) / 2
+    half = half.clamp_min(least)
+    return tuple((middle - half).tolist()), tuple((middle + half).tolist())
+
+
+def workspace_around(position: Tensor) -> Workspace:
+    """The workspace of recordings in which an object is at positions ``[N, D]``, metres.
+
+    Examples:
+        >>> workspace_around(torch.tensor([[0.25, -0.5], [0.5, 0.5]]))
+        Workspace(low=(0.25, -0.5), high=(0.5, 0.5), reach=None, landmarks=())
+    """
+    return Workspace(*box(position, least=0.01))
+
+
+def no_workspace(dim: int = 2) -> Workspace:
+    """The workspace of recordings without positions, ±1 on each axis: none is known."""
+    return Workspace((-1.0,) * dim, (1.0,) * dim)
 
 
 def join_vectors(arrays: Sequence[np.ndarray]) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -35,13 +36,13 @@ def export_dataset(
     Args:
         dataset: The dataset, with a task.
         destination: For ``"hdf5"`` a file as robomimic has it, for ``"npz"`` a folder, for ``"lerobot"`` a folder that
-            LeRobot's own library writes, for ``"minari"`` the id of a dataset, which Minari's library keeps where
-            ``MINARI_DATASETS_PATH`` says.
+            LeRobot's own library writes, for ``"minari"`` the id of a dataset, such as ``"my_arm/demos-v0"``, which
+            Minari's library keeps where ``MINARI_DATASETS_PATH`` says.
         format: The format.
         fps: Frames per second, for ``"lerobot"``; datasets do not know theirs.
 
     Raises:
-        DatasetError: if the dataset has no task, or something is there already.
+        DatasetError: if the dataset has no task, something is there already, or an id is none that Minari takes.
         MissingPackageError: if a package for the format is missing, with the extra to install.
     """
     read(Format, format, "format")
@@ -58,11 +59,7 @@ def _arrays(records: Any, task: Task) -> Arrays:
     """Frames ``[T + 1, ...]`` and steps ``[T, ...]`` of an episode."""
     arrays = {name: value for name, value in records["next"].items() if name not in ("done", "truncated")}
     arrays["pixels"] = arrays["pixels"].movedim(-3, -1)
-    action = records["action"][1:]
-    if task.discrete:
-        action = action.argmax(-1)
-    elif task.action_range is not None:
-        action = task.action_range.to_robot(action)
+    action = task.to_robot(records["action"][1:])
     steps = {name: arrays[name][1:].squeeze(-1) for name in _STEPS if name in arrays}
     return {name: value.numpy() for name, value in {**arrays, **steps, "action": action}.items()}
 
@@ -105,6 +102,7 @@ def _write_minari(destination: str, task: Task, episodes: Iterator[Arrays]) -> N
         import minari
         from gymnasium import spaces
         from minari.data_collector import EpisodeBuffer
+    _check_minari_id(destination)
     buffers, first = [], None
     for number, arrays in enumerate(episodes):
         arrays["pixels"] = np.moveaxis(arrays["pixels"], -1, -3)  # as images Minari would compress them, with losses
@@ -122,13 +120,29 @@ def _write_minari(destination: str, task: Task, episodes: Iterator[Arrays]) -> N
             )
         )
     assert first is not None
-    minari.create_dataset_from_buffers(
-        destination,
-        buffers,
-        observation_space=spaces.Dict({name: _space(spaces, array) for name, array in _frames(first).items()}),
-        action_space=spaces.Discrete(task.action) if task.discrete else _space(spaces, first["action"]),
-        description=f"Exported from torchrl_ocwm, environment {task.name}",
-    )
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", category=UserWarning, module="minari")  # of what a dataset does not know
+        minari.create_dataset_from_buffers(
+            destination,
+            buffers,
+            observation_space=spaces.Dict({name: _space(spaces, array) for name, array in _frames(first).items()}),
+            action_space=spaces.Discrete(task.action) if task.discrete else _space(spaces, first["action"]),
+            description=f"Exported from torchrl_ocwm, environment {task.name}",
+        )
+
+
+def _check_minari_id(name: str) -> None:
+    import minari
+    from minari.dataset.minari_dataset import parse_dataset_id
+
+    try:
+        parse_dataset_id(name)
+    except (TypeError, ValueError):  # without a version, or another form
+        raise DatasetError(
+            f"{name!r} is no id of a Minari dataset; it is a name with a version, as in demos-v0 or my_arm/demos-v0"
+        ) from None
+    if name in minari.list_local_datasets():
+        raise DatasetError(f"{name}: is there already; choose another name or version")
 
 
 def _space(spaces: Any, array: np.ndarray) -> Any:

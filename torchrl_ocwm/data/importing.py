@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from torchrl_ocwm.data.convert import images, join_images, join_vectors, masks
+from torchrl_ocwm.data.convert import box, images, join_images, join_vectors, masks, no_workspace, workspace_around
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset, refuse_another
 from torchrl_ocwm.data.formats import Source, SourceError, open_source
 from torchrl_ocwm.data.formats.source import Format
@@ -67,7 +67,8 @@ class Importing(Settings):
         image_size: Height and width of the images, to which they are scaled; one number for both, ``null`` keeps them.
         metres: Metres of a unit of the positions, 0.001 for millimetres.
         start: The start position, in the unit of the positions; none: their origin.
-        low: Lower corner of the workspace, metres from the start position; none: of all positions.
+        low: Lower corner of the workspace, metres from the start position; none: of all positions. Where there are
+            none, :func:`~torchrl_ocwm.data.transform_dataset` fits it to those that it adds.
         high: Upper corner.
         action_low: What −1 means, one value per action; none: the smallest of the recordings, if any is beyond ±1.
         action_high: What 1 means.
@@ -256,16 +257,20 @@ class Recordings:
         if self.settings.low:
             return Workspace(low=self.settings.low, high=self.settings.high)
         if not self.names["object_position"]:
-            return Workspace(low=(-1.0, -1.0), high=(1.0, 1.0))  # nothing is positioned
+            return no_workspace()
         objects = len(self.settings.objects)
         read = [join_vectors(self._read(number, "object_position")["object_position"]) for number in range(len(self))]
         position = self._metres(torch.cat(read), objects)[:, 0]
-        return Workspace(*_range(position[position.isfinite().all(-1)], least=0.01))
+        seen = position[position.isfinite().all(-1)]
+        if not len(seen):
+            name = self.settings.objects[0]
+            raise SourceError(f"{self.source.path}: {name} is hidden in all frames; give low and high")
+        return workspace_around(seen)
 
     def _action_range(self, actions: Tensor) -> ActionRange | None:
         if self.settings.action_low:
             return ActionRange(low=self.settings.action_low, high=self.settings.action_high)
-        return None if actions.abs().max() <= 1 else ActionRange(*_range(actions, least=1e-3))
+        return None if actions.abs().max() <= 1 else ActionRange(*box(actions, least=1e-3))
 
     # What is read.
 
@@ -279,13 +284,6 @@ class Recordings:
         names = {key: self.names[key] for key in keys or self.names}
         arrays = self.source.read(number, list(dict.fromkeys(name for some in names.values() for name in some)))
         return {key: [arrays[name] for name in some] for key, some in names.items()}
-
-
-def _range(values: Tensor, *, least: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """The smallest box around values ``[N, D]``, no side of which is shorter than ``2 * least``."""
-    middle, half = (values.amax(0) + values.amin(0)) / 2, (values.amax(0) - values.amin(0)) / 2
-    half = half.clamp_min(least)
-    return tuple((middle - half).tolist()), tuple((middle + half).tolist())
 
 
 def _to_task(action: Tensor, task: Task) -> Tensor:

@@ -18,6 +18,7 @@ from torchrl_ocwm.envs.positions import masks_to_positions
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.envs.workspace import Workspace
 from torchrl_ocwm.errors import UserError
+from torchrl_ocwm.images import ImageSize, image_shape
 
 with needs("an environment", "dm-control"):
     import gymnasium
@@ -68,7 +69,8 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         privileged: Add ``object_position_true`` to the observations.
         render_mode: ``"rgb_array"`` makes :meth:`render` return the camera's picture (H, W, 3). For ``"human"``,
             :func:`gymnasium.make` shows it in a window.
-        render_size: Pixels on a side of that picture; ``None``: the image that the agent sees.
+        render_size: Height and width of that picture, pixels; one number for both. A wider one shows more at its sides.
+            ``None``: the image that the agent sees.
 
     Attributes:
         blind: While it is set nothing is rendered, which saves most of the time of a step: images are black, and all
@@ -112,7 +114,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         camera_options: dict[str, Any] | None = None,
         privileged: bool = False,
         render_mode: str | None = None,
-        render_size: int | None = None,
+        render_size: ImageSize | None = None,
     ) -> None:
         counts = {
             "image_size": image_size,
@@ -122,7 +124,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
             **({} if render_size is None else {"render_size": render_size}),
         }
         for name, value in counts.items():
-            if value < 1:
+            if min(image_shape(value)) < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
         for name, value in {"virtual_target": virtual_target, "labelled_frames": labelled_frames}.items():
             if value < 0:
@@ -264,8 +266,8 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         if self.render_size is None:
             return np.ascontiguousarray(self._observe(self.data)["pixels"].transpose(1, 2, 0))
         if self._large_camera is None:
-            size: dict[str, Any] = {"height": self.render_size, "width": self.render_size, "multisampling": 4}
-            self._large_camera = Camera(self.model, self.camera_name, **size)
+            height, width = image_shape(self.render_size)
+            self._large_camera = Camera(self.model, self.camera_name, height=height, width=width, multisampling=4)
         return self._large_camera.picture(self.data)
 
     def close(self) -> None:

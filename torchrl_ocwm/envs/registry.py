@@ -100,6 +100,21 @@ def find_environment(name: str) -> Environment:
     return found
 
 
+def environment_of(task: Task) -> Environment:
+    """The environment that agents of a task are played in.
+
+    Raises:
+        SettingsError: if none is registered under its name, as for recordings of one's own.
+    """
+    found = _look_up(task.name)
+    if found is None:
+        raise SettingsError(
+            f"no environment {task.name!r} is registered, only recordings are there, so that its agents cannot be "
+            "played: `ocwm diagnose` examines them on the recordings, and register_environment adds an environment"
+        )
+    return found
+
+
 @dataclass(frozen=True)
 class EnvChoice(Settings):
     """An environment by name, and its options.

@@ -105,6 +105,22 @@ class Task(Settings):
         """Height and width of the images, pixels."""
         return image_shape(self.image_size)
 
+    def to_robot(self, action: Tensor) -> Tensor:
+        """Actions ``[..., A]`` of an agent as the robot takes them: in its units, or the number ``[...]`` of a choice.
+
+        Examples:
+            >>> import torch
+            >>> box = Workspace(low=(0.0, 0.0), high=(0.3, 0.3))
+            >>> joints = ActionRange(low=(0.0, -2.0), high=(4.0, 2.0))
+            >>> Task("arm", 64, ("cube",), 6, 2, box, action_range=joints).to_robot(torch.tensor([-0.5, 1.0]))
+            tensor([1., 2.])
+            >>> Task("arm", 64, ("cube",), 6, 3, box, discrete=True).to_robot(torch.tensor([0.0, 0.0, 1.0]))
+            tensor(2)
+        """
+        if self.discrete:
+            return action.argmax(-1)
+        return action if self.action_range is None else self.action_range.to_robot(action)
+
     def to_dict(self) -> dict[str, Any]:
         """A mapping that fits in JSON."""
         return to_dict(self)

@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from torchrl_ocwm.data.records import episode_to_records
 from torchrl_ocwm.data.seeds import episode_seed
-from torchrl_ocwm.envs import Task, find_environment, make_scene
+from torchrl_ocwm.envs import Task, environment_of, make_scene
 from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.evaluation.randomness import EpisodeRandomness
@@ -111,7 +111,7 @@ class EvaluationEnvs:
     ) -> None:
         self.task, self.episode_steps, self.envs = task, episode_steps, envs
         options = {**task.options, "horizon": episode_steps, "privileged": True}
-        make = partial(SteppedEnvs, partial(make_scene, find_environment(task.name), **options))
+        make = partial(SteppedEnvs, partial(make_scene, environment_of(task), **options))
         self._workers: list[Worker] = []
         try:
             for _ in range(max(workers, 1)):
@@ -272,7 +272,7 @@ def goal_images(task: Task, goals: Tensor, *, object_index: int = 0) -> Tensor:
     Returns:
         ``[N, 3, H, W]`` uint8.
     """
-    with closing(make_scene(find_environment(task.name), **task.options)) as scene:
+    with closing(make_scene(environment_of(task), **task.options)) as scene:
         scene.reset(seed=0)
         images = [scene.goal_observation(goal, object_index)["pixels"] for goal in goals.numpy()]
         return torch.stack([torch.from_numpy(image) for image in images])

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from torchrl_ocwm.agents.agent import Agent
-from torchrl_ocwm.envs import ENVIRONMENTS, Task, find_environment
+from torchrl_ocwm.envs import ENVIRONMENTS, Task, environment_of
 from torchrl_ocwm.envs.registry import Environment
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, Policy, goal_images, measure
 from torchrl_ocwm.processes import Worker, make_worker
@@ -31,7 +31,7 @@ def can_play(task: Task) -> bool:
         True
     """
     try:
-        find_environment(task.name)
+        environment_of(task)
     except SettingsError:
         warnings.warn(
             f"no evaluations during training: no environment {task.name!r} is registered, only recordings are there; "
@@ -72,7 +72,7 @@ class LandmarkEvaluation:
         images = None if self.policy.takes_positions else goal_images(task, self.goals, object_index=index)
         # Without the agent that a policy knows.
         acts = deepcopy(TensorDictSequential(*self.policy.module)).cpu() if beside else self.policy
-        make = partial(LandmarkEpisodes, acts, find_environment(task.name), task, self.goals, images, index)
+        make = partial(LandmarkEpisodes, acts, environment_of(task), task, self.goals, images, index)
         self._worker: Worker = make_worker(partial(make, episode_steps, episodes), process=beside, timeout=_TIMEOUT)
         self._is_ready = False
 

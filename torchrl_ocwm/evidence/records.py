@@ -7,11 +7,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torchrl_ocwm.agents.presets import flat
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evidence.runs import Command, Run
-from torchrl_ocwm.settings import to_dict
+from torchrl_ocwm.settings import flat, to_dict
 
 RECORD, LOG = "run.json", "log.txt"
 

@@ -11,14 +11,14 @@ from omegaconf import OmegaConf
 
 from torchrl_ocwm.agents import agent_name, load_agent, save_agent
 from torchrl_ocwm.agents.agent import Agent
-from torchrl_ocwm.agents.presets import flat
-from torchrl_ocwm.agents.sources import AGENT_FILE
+from torchrl_ocwm.agents.sources import AGENT_FILE, is_name
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.report import Report
 from torchrl_ocwm.evidence.estimate import in_words
 from torchrl_ocwm.evidence.records import RECORD, Record, RecordError
 from torchrl_ocwm.provenance import MADE
+from torchrl_ocwm.settings import flat
 from torchrl_ocwm.training import CHECKPOINT
 
 CARD = "README.md"
@@ -81,6 +81,11 @@ def _of_evaluate(evaluation: Path) -> tuple[Path, dict[str, str]]:
     """The checkpoint, and what the settings beside it say."""
     sources = [one for row in Report.load(evaluation / "results.json").rows.values() for one in row.sources]
     files = list(dict.fromkeys(one for one in sources if isinstance(one, Path)))
+    names = [one for one in sources if is_name(one)]
+    if names and not files:
+        raise RecordError(
+            f"{evaluation}: is of {names[0]}, which others have by that name; there is no checkpoint of yours to share"
+        )
     if len(files) != 1:
         raise RecordError(f"{evaluation}: is of {len(files)} checkpoints; evaluate the one to share alone")
     settings = files[0].parent / "config.yaml"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from torchrl_ocwm.agents import Agent, load_agent, shipped_agents
-from torchrl_ocwm.envs import ENVIRONMENTS
+from torchrl_ocwm.envs import ENVIRONMENTS, environment_of
 from torchrl_ocwm.envs.registry import not_installed
 from torchrl_ocwm.play.session import Session
 
@@ -40,8 +40,8 @@ class Player(NamedTuple):
         """A session in which it acts."""
         if self.agent is None:
             return Session(self.environment, seed=seed)
-        policy = self.agent.policy(behaviour or self.acting)
-        return Session(self.environment, policy, options=dict(self.agent.task.options), seed=seed)
+        policy, task = self.agent.policy(behaviour or self.acting), self.agent.task
+        return Session(environment_of(task).name, policy, options=dict(task.options), seed=seed)
 
 
 def find_players(agents: Sequence[str], behaviour: str | None = None) -> list[Player]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -22,10 +23,12 @@ from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.files import as_file_name, seen_from
 from torchrl_ocwm.parts import load_plugins
 from torchrl_ocwm.provenance import MADE, commit, machine
-from torchrl_ocwm.settings import SettingsError, field_docs, from_dict, to_dict
+from torchrl_ocwm.recipes.help import help_text
+from torchrl_ocwm.settings import SettingsError, from_dict, to_dict
 
 with needs("a recipe", "recipes"):
     import hydra
+    from hydra._internal.utils import get_args_parser
     from hydra.core.config_store import ConfigStore
     from hydra.core.hydra_config import HydraConfig
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -57,6 +60,7 @@ def recipe(
     def decorate(function: Callable[[T], None]) -> Callable[[], None]:
         """The script's main function."""
         kind: type[T] = next(iter(get_type_hints(function).values()))
+        about = sys.modules[function.__module__].__doc__ or ""
 
         def guarded(config: DictConfig) -> None:
             with _user_errors():
@@ -65,9 +69,10 @@ def recipe(
         def main() -> None:
             with _user_errors():
                 store_options()
+                _check_words(sys.argv[1:])
                 _check_choices(groups or {}, sys.argv[1:])
-            ConfigStore.instance().store(name, _schema(kind, groups or {}, more))
-            with _without(GROUPS - set(groups or {})):
+            ConfigStore.instance().store(name, _schema(kind, groups or {}, more, about))
+            with _short_warnings(), _without(GROUPS - set(groups or {})):
                 hydra.main(version_base="1.3", config_path=None, config_name=name)(guarded)()
 
         return main
@@ -106,6 +111,13 @@ def _without(groups: Iterable[str]) -> Iterator[None]:
         yield
     finally:
         repo.update(aside)
+
+
+def _check_words(arguments: Iterable[str]) -> None:
+    """Hydra's message for a word that is no setting does not say which one it is."""
+    for word in get_args_parser().parse_args([*arguments]).overrides:
+        if "=" not in word and not word.startswith("~"):
+            raise SettingsError(f"{word!r} was not understood; settings are given as NAME=VALUE, and --help shows them")
 
 
 def _check_choices(groups: Iterable[str], arguments: Iterable[str]) -> None:
@@ -153,24 +165,6 @@ def run_folder(output: str) -> Path:
     return Path(output, as_file_name(",".join(item for key, item in given.items() if key not in shown)))
 
 
-def help_lines(kind: type, at: str = "") -> Iterator[str]:
-    """What each setting of a class is, with its default: one line each.
-
-    Examples:
-        >>> from torchrl_ocwm.training.settings import Training
-        >>> next(help_lines(Training, "training"))
-        'training.updates=10000: Updates of model, actor and critic in all.'
-    """
-    hints, docs = get_type_hints(kind), field_docs(kind)
-    for one in fields(kind):
-        name = f"{at}.{one.name}" if at else one.name
-        if is_dataclass(hints[one.name]):
-            yield from help_lines(hints[one.name], name)
-        else:
-            value = f"={_shown(one.default)}" if one.default is not MISSING else ""
-            yield f"{name}{value}: {docs.get(one.name, '')}"
-
-
 def defaults(kind: Any) -> dict[str, Any]:
     """The fields of a settings class with their defaults; ``"???"``, as Hydra has it, for what has to be given.
 
@@ -180,6 +174,27 @@ def defaults(kind: Any) -> dict[str, Any]:
         {'warmup': 0}
     """
     return {one.name: _default(one) for one in fields(kind)}
+
+
+@contextmanager
+def _short_warnings() -> Iterator[None]:
+    """Warnings are one line too, without the line of code that gave them."""
+    before = warnings.formatwarning
+    warnings.formatwarning = _one_line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
+
+
+def _one_line(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,  # noqa: ARG001
+    lineno: int,  # noqa: ARG001
+    line: str | None = None,  # noqa: ARG001
+) -> str:
+    return f"{category.__name__}: {' '.join(str(message).split())}\n"
 
 
 @contextmanager
@@ -193,13 +208,13 @@ def _user_errors() -> Iterator[None]:
         sys.exit(" ".join(f"{type(error).__name__}: {error}".split()))
 
 
-def _schema(kind: type, groups: Mapping[str, str], more: Mapping[str, Any]) -> dict[str, Any]:
+def _schema(kind: type, groups: Mapping[str, str], more: Mapping[str, Any], about: str) -> dict[str, Any]:
     """The configuration of a recipe: its groups, and all other settings with their defaults."""
     plain = {name: value for name, value in defaults(kind).items() if name not in groups}
     chosen: list[Any] = [{group: choice} for group, choice in groups.items()]
     quiet = [{f"override hydra/{part}": "none"} for part in _QUIET]
-    text = "\n".join(help_lines(kind)).replace("$", "")
-    own = {"run": {"dir": "."}, "output_subdir": None, "help": {"header": f"Settings:\n{text}\n"}, **more}
+    text = help_text(about, kind, groups).replace("$", "")
+    own = {"run": {"dir": "."}, "output_subdir": None, "help": {"header": text}, **more}
     return {"defaults": [*chosen, "_self_", *quiet], **plain, "hydra": own}
 
 
@@ -255,9 +270,3 @@ def _default(one: Any) -> Any:
     if one.default is not MISSING:
         return to_dict(one.default)
     return "???" if one.default_factory is MISSING else to_dict(one.default_factory())
-
-
-def _shown(value: Any) -> str:
-    """A value as the command line takes it."""
-    plain = to_dict(value)
-    return {"None": "null", "True": "true", "False": "false"}.get(str(plain), str(plain))

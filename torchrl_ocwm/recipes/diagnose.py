@@ -33,6 +33,7 @@ from torchrl_ocwm.evaluation import (
 from torchrl_ocwm.modules import ObjectWorldModel
 from torchrl_ocwm.recipes.config import kept, recipe
 from torchrl_ocwm.recipes.diagnosis_tables import error_table, goal_table
+from torchrl_ocwm.settings import differences
 from torchrl_ocwm.signals import ended_by_signals
 
 
@@ -79,7 +80,8 @@ def _records(path: Path, checkpoint: str, task: Task, settings: Diagnosis) -> Te
     dataset = EpisodeDataset.open(path)
     there = dataset.task
     if there != task:
-        raise DatasetError(f"{dataset.path}: holds {there}, but the agent in {checkpoint} is of {task}")
+        different = differences(there, task, "in the dataset", "in that of the agent")
+        raise DatasetError(f"{dataset.path}: is of another task than the agent in {checkpoint} ({different})")
     records = random_sequences(dataset, settings.sequences, settings.length, seed=settings.seed)
     return records.to(settings.device)
 

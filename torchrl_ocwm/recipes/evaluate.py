@@ -32,7 +32,7 @@ from torchrl_ocwm.evaluation import (
 from torchrl_ocwm.recipes.config import kept, recipe
 from torchrl_ocwm.recipes.pictures import FILMS, draw, film, picture_episodes
 from torchrl_ocwm.recipes.scores import IMAGE_GOALS, goal_kinds, score
-from torchrl_ocwm.settings import SettingsError
+from torchrl_ocwm.settings import SettingsError, differences
 from torchrl_ocwm.signals import ended_by_signals
 
 
@@ -139,9 +139,14 @@ def _runs(names: Sequence[str], files: list[Path], policies: list[Policy], repor
 
 def _one_task(policies: list[Policy], files: list[Path]) -> Task:
     """The task of all of them; scores of different objects are not to be compared either."""
-    tasks = [(policy.agent.task, policy.object_index) for policy in policies]
-    for (task, index), file in zip(tasks, files, strict=True):
-        if (task, index) != tasks[0]:
-            this, first = (f"the {one.objects[number]!r} of {one}" for one, number in ((task, index), tasks[0]))
-            raise SettingsError(f"{file} is about {this}, {files[0]} about {first}; evaluate them one after the other")
-    return tasks[0][0]
+    tasks = [policy.agent.task for policy in policies]
+    about = [
+        {"object": task.objects[policy.object_index], **task.to_dict()}
+        for task, policy in zip(tasks, policies, strict=True)
+    ]
+    for file, one in zip(files, about, strict=True):
+        if different := differences(one, about[0], "there", "here"):
+            raise SettingsError(
+                f"{file} is about something else than {files[0]} ({different}); evaluate them one after the other"
+            )
+    return tasks[0]

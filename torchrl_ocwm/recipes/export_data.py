@@ -17,7 +17,7 @@ class ExportData(Settings):
     Args:
         dataset: Folder of the dataset.
         format: Of the recordings: ``"hdf5"`` of robomimic, ``"npz"``, ``"minari"``, ``"lerobot"``.
-        destination: File or folder to make; for ``"minari"`` the id of the dataset.
+        destination: File or folder to make; for ``"minari"`` the id of the dataset, such as ``my_arm/demos-v0``.
         fps: Frames per second, which LeRobot keeps.
     """
 

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm.agents import Agent, Policy
-from torchrl_ocwm.envs import Task, find_environment, make_scene
+from torchrl_ocwm.envs import Task, environment_of, make_scene
 from torchrl_ocwm.evaluation import (
     Report,
     decode_video,
@@ -60,7 +60,7 @@ def film(
     task = policy.agent.task
     latents = imagined_rollout(policy.behaviour, episodes["latent"][:, 0], episodes.shape[1], seed=seed)["latent"]
     imagined = decode_video(policy.agent.model, latents)
-    with closing(make_scene(find_environment(task.name), **task.options)) as scene:
+    with closing(make_scene(environment_of(task), **task.options)) as scene:
         points = torch.as_tensor(scene.project(goals.numpy()))
     rows = [mark(episodes["transition", "next", "pixels"], points), mark(imagined, points)]
     if images is not None:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 
 import torch
 
 from torchrl_ocwm.agents import AgentConfig, Size, build_agent
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.devices import usable_device
-from torchrl_ocwm.envs import RecordedEnv
+from torchrl_ocwm.envs import ENVIRONMENTS, RecordedEnv
 from torchrl_ocwm.evaluation import OpenLoopFilm
 from torchrl_ocwm.recipes.config import keep_settings, recipe, run_folder
 from torchrl_ocwm.recipes.landmarks import landmark_evaluation
@@ -46,11 +47,22 @@ class TrainOffline(Settings):
     )
 
 
+def _open(config: TrainOffline) -> EpisodeDataset:
+    try:
+        return EpisodeDataset.open(config.dataset)
+    except DatasetError as error:
+        name = config.env.name
+        if Path(config.dataset).exists() or name not in ENVIRONMENTS:
+            raise
+        where = "" if config.dataset == f"data/{name}" else f" dataset={config.dataset}"
+        raise DatasetError(f"{error}; `ocwm collect env={name}{where}` makes one") from None
+
+
 @recipe("train_offline", {"agent": "dreamer_pcp", "explore": "none", "env": "reacher", "size": "cpu"})
 def main(config: TrainOffline) -> None:
     """Train, from the checkpoint if there is one."""
     training = config.training
-    dataset = EpisodeDataset.open(config.dataset)
+    dataset = _open(config)
     if (recorded := dataset.task.name) != config.env.name:
         raise DatasetError(f"{dataset.path}: holds {recorded}, not env={config.env.name}; give env.name={recorded}")
     # Whatever the command line says: the dataset's options are those that are trained on.

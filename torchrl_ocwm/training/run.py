@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, unravel_key
 from torchrl.checkpoint import CheckpointError, GlobalRNGState
 from torchrl.trainers import LRSchedulerHook
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
@@ -20,6 +20,7 @@ from torchrl_ocwm.agents.checkpoint import check_same_agent, describe
 from torchrl_ocwm.agents.requirements import lacking, remedies
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, RelabelGoals, make_replay_buffer
 from torchrl_ocwm.files import only_writer
+from torchrl_ocwm.settings import differences
 from torchrl_ocwm.training.cores import update_threads
 from torchrl_ocwm.training.evaluations import Evaluate, Evaluations
 from torchrl_ocwm.training.hooks import EveryUpdates, LossLog, ProgressBar, RunTrainer, StopOnSignals, UpdateClock
@@ -208,9 +209,11 @@ def check_task(agent: Agent, dataset: EpisodeDataset) -> None:
         DatasetError: if it is of another task, lacks keys, or shows goals that imagination would contradict.
     """
     if dataset.task != agent.task:
-        raise DatasetError(f"{dataset.path}: holds {dataset.task}, but the agent was built for {agent.task}")
+        different = differences(dataset.task, agent.task, "in the dataset", "in that of the agent")
+        raise DatasetError(f"{dataset.path}: is of another task than the agent ({different})")
     if missing := lacking(agent, dataset):
-        raise DatasetError(f"{dataset.path}: holds no {missing}, which this agent learns from. {remedies(missing)}")
+        names = ", ".join(key if isinstance(key, str) else "/".join(key) for key in map(unravel_key, missing))
+        raise DatasetError(f"{dataset.path}: holds no {names}, which this agent learns from. {remedies(missing)}")
     imagined = [name for name, one in agent.config.behaviours.items() if one.goals.gives]
     if dataset.images_show_goal and imagined:
         raise DatasetError(

@@ -36,7 +36,8 @@ class MinariSource(Source):
             self.dataset: Any = minari.MinariDataset(folder) if folder.exists() else minari.load_dataset(path)
         except (OSError, ValueError) as error:
             raise SourceError(
-                f"{path}: no Minari dataset on this machine ({error}); `minari download {path}` gets it"
+                f"{path}: no such file or folder, and no Minari dataset on this machine ({error}); "
+                f"`minari download {path}` gets one of Minari's"
             ) from error
 
     def __len__(self) -> int:

@@ -85,7 +85,10 @@ def open_source(path: str, kind: Format | None = None) -> Source:
         SourceError: if there are none.
         MissingPackageError: if a package for the format is missing, with the extra to install.
     """
-    module, _, name = FORMATS[kind or _recognise(path)].partition(":")
+    kind = kind or _recognise(path)
+    if kind != "minari" and not Path(path).exists():
+        raise SourceError(f"{path}: no such file or folder")
+    module, _, name = FORMATS[kind].partition(":")
     source: Source = getattr(import_module(f"torchrl_ocwm.data.formats.{module}"), name)(path)
     if not len(source):
         raise SourceError(f"{path}: holds no episodes")
