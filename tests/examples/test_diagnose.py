@@ -79,7 +79,7 @@ def test_errors_are_one_message(dataset: EpisodeDataset, tmp_path: Path) -> None
     short = random_dataset(tmp_path / "short", reacher_task(), length=8)
     file = checkpoint("focus_lcp", tmp_path)
     messages = {
-        (f"dataset={other.path}",): f"DatasetError: {other.path}: holds Task(name='reacher', image_size=32",
+        (f"dataset={other.path}",): f"DatasetError: {other.path}: is of another task",
         (f"dataset={short.path}",): f"{short.path}: cannot cut sequences of 9 frames, the longest episode has 8",
         (f"dataset={dataset.path}", "context=9"): "SettingsError: context=9 of length=9 frames",
     }

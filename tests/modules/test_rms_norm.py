@@ -41,6 +41,12 @@ def test_calculates_in_float32() -> None:
     assert large.grad.dtype == torch.float16
 
 
+def test_keeps_float64() -> None:
+    norm, value = RMSNorm(torch.nn.Parameter(torch.rand(3).double())), torch.rand(4, 3).double().requires_grad_()
+    torch.testing.assert_close(norm(value), rms_norm(value, (3,), norm.weight, 1e-4), rtol=0, atol=1e-8)
+    assert torch.autograd.gradcheck(lambda one: norm(one), value)
+
+
 @pytest.mark.parametrize(
     ("network", "value", "kind"),
     [

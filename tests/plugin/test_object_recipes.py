@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from other_package import plugin  # noqa: F401
 from tensordict import TensorDictBase
 from torch import Tensor
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from other_package import plugin  # noqa: F401
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_ocwm import build_agent, load_agent, make_env, make_task

@@ -31,7 +31,9 @@ def _store() -> Iterator[None]:
 
 def compose(*overrides: str) -> AgentConfig:
     store_options()
-    ConfigStore.instance().store("explore_test", _schema(Recipe, {"agent": "focus_lcp", "explore": "none"}, {}))
+    ConfigStore.instance().store(
+        "explore_test", _schema(Recipe, {"agent": "focus_lcp", "explore": "none"}, {}, "A recipe.")
+    )
     config = hydra.compose("explore_test", list(overrides))
     return from_dict(Recipe, OmegaConf.to_container(config)).agent
 

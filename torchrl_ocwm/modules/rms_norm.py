@@ -99,7 +99,7 @@ class _RMSNormSiLU(torch.autograd.Function):
 
 
 def _precise(value: Tensor) -> Tensor:
-    return value.to(torch.promote_types(value.dtype, torch.float32))
+    return value if value.dtype == torch.float64 else value.float()
 
 
 def _scale(x: Tensor, eps: Tensor) -> Tensor:
