@@ -26,8 +26,7 @@ LONG := \
 	tests/examples/test_benchmarks.py::test_speed_of_an_evaluation_adds_up
 # Other Pythons, of which the machine may have some (`python3.10`, or in pyenv): the package and its recipes, no simulator.
 PYTHONS := 3.10 3.13
-# With CUDA, as the package registry has PyTorch for Linux, an environment takes 5 GB. It goes when its tests have passed.
-# GB that must be free for it:
+# GB that must be free for one of them: it comes with CUDA, 5 GB. It goes when its tests have passed.
 PYTHON_SPACE := 10
 NEXT_VERSIONS := torchrl-nightly==2026.10.27 tensordict==0.15.3
 

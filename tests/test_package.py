@@ -195,6 +195,15 @@ def test_make_goes_on_with_a_version_that_it_takes(tmp_path: Path) -> None:
     assert "makes an environment" in run_make(tmp_path, "3.10").stdout
 
 
+def test_make_leaves_no_environment_of_another_python_and_needs_room_for_it() -> None:
+    def says(*arguments: str) -> str:
+        return subprocess.run(["make", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+    assert "its packages need 999999: not tested with it" in says("test-python-3.10", "PYTHON_SPACE=999999")
+    assert "not on this machine: not tested with it" in says("test-python-0.0", "PYTHON_SPACE=0")
+    assert says("-n", ".venv-0.0/.tested", "FOUND=python").splitlines()[-1] == "rm -r .venv-0.0"
+
+
 @pytest.mark.parametrize("extra", ["robosuite", "dm-control"])
 def test_a_simulator_without_packages_for_this_python(monkeypatch: pytest.MonkeyPatch, extra: str) -> None:
     module = extra.replace("-", "_")

@@ -27,8 +27,8 @@ class Behaviour(Settings):
         goal: How a goal becomes what policy and critic see beside the latent.
         reward: The reward in imagination.
         goals: Where goals in imagination come from.
-        object: Which object it is about, by the task's names; ``None``: the first. Rewards of exploration are about it
-            only where they have a setting for that, such as ``objects="one"``; its scores are in any case.
+        object: Which object it is about, by the task's names; ``None``: the first. The reward of an explorer is about
+            it only with ``objects="one"``; its scores always are.
     """
 
     goal: Goal = field(default_factory=NoGoal)

@@ -24,7 +24,7 @@ from torchrl_ocwm.files import as_file_name, seen_from
 from torchrl_ocwm.parts import load_plugins
 from torchrl_ocwm.provenance import MADE, commit, machine
 from torchrl_ocwm.recipes.help import help_text
-from torchrl_ocwm.settings import SettingsError, from_dict, to_dict
+from torchrl_ocwm.settings import SettingsError, flat, from_dict, to_dict
 
 with needs("a recipe", "recipes"):
     import hydra
@@ -246,15 +246,7 @@ def _rows(choices: Mapping[str, Any]) -> dict[str, Any]:
 def _named(overrides: Iterable[str]) -> Iterator[str]:
     """The dotted names of all settings that the command line gives."""
     for override in OverridesParser.create().parse_overrides(list(overrides)):
-        yield from _leaves(override.value(), override.key_or_group)
-
-
-def _leaves(value: Any, at: str) -> Iterator[str]:
-    if isinstance(value, dict):
-        for name, part in value.items():
-            yield from _leaves(part, f"{at}.{name}")
-    else:
-        yield at
+        yield from flat({override.key_or_group: override.value()})
 
 
 def _without_leftovers(values: Any, row: Any, given: Set[str], at: str) -> Any:
