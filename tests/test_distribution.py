@@ -33,7 +33,7 @@ from threading import Event
 from types import SimpleNamespace
 
 from torchrl_ocwm.evidence import Record, queue
-from torchrl_ocwm.provenance import commit
+from torchrl_ocwm.origin import commit
 
 run, record = SimpleNamespace(name="runs"), Record(content={}, pace="", work=0)
 job = queue.Job(run, Path(), [], record, threads=1, program=queue.PROGRAM)

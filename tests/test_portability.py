@@ -23,7 +23,7 @@ POSIX = {"fcntl", "grp", "posix", "pty", "pwd", "readline", "resource", "syslog"
 #: Starts processes in the way of the system, which is fork on Linux.
 STARTS = {"Manager", "Pool", "Process", "ProcessPoolExecutor", "Queue"}
 #: Read where it is there, for the name of the processor.
-ONLY_ON_LINUX = {"torchrl_ocwm/provenance.py": {"/proc/cpuinfo"}}
+ONLY_ON_LINUX = {"torchrl_ocwm/origin.py": {"/proc/cpuinfo"}}
 
 
 def found(tree: ast.AST, file: str = "") -> list[str]:

@@ -9,7 +9,7 @@ import pytest
 
 from torchrl_ocwm.evidence import Collected, Evaluated, Explored, Machine, Record, Run, Trained, forecast, table
 from torchrl_ocwm.evidence.estimate import Forecast, Paces
-from torchrl_ocwm.provenance import machine
+from torchrl_ocwm.origin import machine
 from torchrl_ocwm.settings import to_dict
 
 TINY = {"image_size": 16, "horizon": 20}

@@ -112,11 +112,15 @@ def test_runs_of_other_commands(plain: Path, tmp_path: Path) -> None:
     assert load_agent(tmp_path / "shared").agent.task == reacher_task()
     assert "| training | 1,500 updates, seed 4 |" in card
     assert "| data | 70 scripted steps and 30 random steps, and then its own, 0.5 updates per step |" in card
-    assert "| commit | abc |\n| machine | a machine |" in card
+    assert "| machine | a machine |\n| commit | abc |" in card
 
 
 def test_runs_on_a_dataset(plain: Path, tmp_path: Path) -> None:
     (tmp_path / "run" / "config.yaml").write_text("training: {updates: 1500, seed: 4}\ndataset: ../data\n")
+    for damaged in ("{", "[]", '{"commit": 1}'):
+        (tmp_path / "run" / "made.json").write_text(damaged)
+        with pytest.raises(RecordError, match=r"made\.json: cannot be read .*; without it the card names no commit"):
+            share(plain, tmp_path / "shared")
     (tmp_path / "run" / "made.json").unlink()  # of a release before
     card = (share(plain, tmp_path / "shared") / "README.md").read_text()
     assert "| data | not where it was |" in card

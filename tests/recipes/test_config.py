@@ -28,7 +28,7 @@ from torchrl_ocwm.agents import (
     StateEntropy,
 )
 from torchrl_ocwm.envs.registry import ENVIRONMENTS
-from torchrl_ocwm.provenance import commit, machine
+from torchrl_ocwm.origin import commit, machine
 from torchrl_ocwm.recipes import keep_settings
 from torchrl_ocwm.recipes.config import recipe
 from torchrl_ocwm.recipes.help import help_text

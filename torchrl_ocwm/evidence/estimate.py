@@ -18,7 +18,7 @@ from torchrl_ocwm.evaluation.episodes import EvaluationEnvs
 from torchrl_ocwm.evidence.records import RECORD, Record
 from torchrl_ocwm.evidence.runs import UPDATE_RATIO, Collected, Evaluated, Explored, Run, Trained
 from torchrl_ocwm.evidence.settings import Machine
-from torchrl_ocwm.provenance import machine
+from torchrl_ocwm.origin import machine
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records
 from torchrl_ocwm.training import Training, make_stepper

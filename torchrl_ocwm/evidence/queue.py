@@ -17,7 +17,7 @@ from torchrl_ocwm.evidence.launchers import Launcher
 from torchrl_ocwm.evidence.records import LOG, Record
 from torchrl_ocwm.evidence.runs import Command, Run
 from torchrl_ocwm.evidence.settings import Machine
-from torchrl_ocwm.provenance import commit, machine
+from torchrl_ocwm.origin import commit, machine
 
 CHILD, PROGRAM = Path(__file__).with_name("child.py"), "torchrl_ocwm.console"
 _LOOK, _NOTE = 0.2, 30.0  # seconds between two looks at a process, and between two notes of the time

@@ -17,7 +17,7 @@ from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.report import Report
 from torchrl_ocwm.evidence.estimate import in_words
 from torchrl_ocwm.evidence.records import RECORD, Record, RecordError
-from torchrl_ocwm.provenance import MADE
+from torchrl_ocwm.origin import MADE
 from torchrl_ocwm.settings import flat
 from torchrl_ocwm.training import CHECKPOINT
 
@@ -93,12 +93,22 @@ def _of_evaluate(evaluation: Path) -> tuple[Path, dict[str, str]]:
         raise RecordError(f"{settings}: no such file; the card says what it has of the training")
     config: Any = OmegaConf.to_container(OmegaConf.load(settings))
     training = config["training"]
-    facts = {
-        "training": f"{training['updates']:,} updates, seed {training['seed']}",
+    return files[0], {
         "data": _data(config, settings.parent),
+        "training": f"{training['updates']:,} updates, seed {training['seed']}",
+        **_made(settings.parent / MADE),
     }
-    made = settings.parent / MADE
-    return files[0], {**facts, **(json.loads(made.read_text(encoding="utf-8")) if made.exists() else {})}
+
+
+def _made(file: Path) -> dict[str, str]:
+    """What a run says of its commit and machine; those of releases before say nothing."""
+    if not file.exists():
+        return {}
+    try:
+        said = json.loads(file.read_text(encoding="utf-8"))
+        return {name: str(said[name]) for name in ("machine", "commit")}
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordError(f"{file}: cannot be read ({error!r}); without it the card names no commit") from error
 
 
 def _data(config: Mapping[str, Any], folder: Path) -> str:

@@ -21,8 +21,8 @@ from torchrl_ocwm.envs.registry import ENVIRONMENTS
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.files import as_file_name, seen_from
+from torchrl_ocwm.origin import MADE, commit, machine
 from torchrl_ocwm.parts import load_plugins
-from torchrl_ocwm.provenance import MADE, commit, machine
 from torchrl_ocwm.recipes.help import help_text
 from torchrl_ocwm.settings import SettingsError, flat, from_dict, to_dict
 

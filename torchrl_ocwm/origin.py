@@ -1,4 +1,4 @@
-"""Which code does something, and where."""
+"""Which commit a run is of, and which machine does it."""
 
 from __future__ import annotations
 
