@@ -1,5 +1,6 @@
 """One camera for colours, segmentation and depth, checked on a scene whose picture is known."""
 
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
@@ -250,6 +251,23 @@ def test_a_camera_of_another_thread(model, data):
 
     with ThreadPoolExecutor(1) as other:
         assert (other.submit(look).result().geoms == BALL).any()
+
+
+def test_a_camera_that_python_collects_in_another_thread(model, monkeypatch):
+    """It says nothing, as nobody could mend that there; in its own thread it is freed."""
+    said = []
+    monkeypatch.setattr(sys, "unraisablehook", said.append)
+    cameras = [Camera(model, "top", height=HEIGHT, width=WIDTH)]
+    with ThreadPoolExecutor(1) as other:
+        other.submit(cameras.clear).result()
+    assert not said
+    camera = Camera(model, "top", height=HEIGHT, width=WIDTH)
+    closed = []
+    monkeypatch.setattr(Camera, "close", lambda camera: closed.append(camera))
+    camera.__del__()
+    assert closed == [camera]
+    monkeypatch.undo()
+    camera.close()
 
 
 def test_unknown_camera_lists_those_there_are(model):

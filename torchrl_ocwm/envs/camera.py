@@ -224,5 +224,7 @@ class Camera:
         OPEN.discard(self)
 
     def __del__(self) -> None:
-        if not sys.is_finalizing() and "_gl" in self.__dict__:
+        # Python may collect it in another thread, which cannot free what is OpenGL's.
+        mine = threading.current_thread() is self.__dict__.get("_thread")
+        if mine and not sys.is_finalizing() and "_gl" in self.__dict__:
             self.close()
