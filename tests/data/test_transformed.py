@@ -154,3 +154,24 @@ def test_what_comes_out_must_be_as_the_contract_says(tmp_path: Path) -> None:
         transform_dataset(recorded, tmp_path / "copy", Broken())
     with pytest.raises(DatasetError, match="there is a dataset here already"):
         transform_dataset(recorded, recorded.path, Doubled())
+
+
+def test_a_copy_that_fails_halfway_leaves_nothing(tmp_path: Path) -> None:
+    class Failing(Doubled):
+        def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+            if len(self.lengths) == 2:
+                raise RuntimeError("the camera has no more")
+            return super().forward(tensordict)
+
+    recorded = random_dataset(tmp_path / "recorded", TASK, episodes=3)
+    with pytest.raises(RuntimeError, match="no more"):
+        transform_dataset(recorded, tmp_path / "copy", Failing())
+    assert [file.name for file in tmp_path.iterdir()] == ["recorded"]
+
+
+def test_a_place_where_no_copy_can_be(tmp_path: Path) -> None:
+    recorded = random_dataset(tmp_path / "recorded", TASK)
+    (tmp_path / "file").touch()
+    for place in ("file", "file/copy"):
+        with pytest.raises(DatasetError, match=f"{place}: (there is something else here|cannot be made)"):
+            transform_dataset(recorded, tmp_path / place, Doubled())

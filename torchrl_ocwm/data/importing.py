@@ -13,13 +13,13 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from torchrl_ocwm.data.convert import box, images, join_images, join_vectors, masks, no_workspace, workspace_around
-from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset, refuse_another
+from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
+from torchrl_ocwm.data.draft import draft_of
 from torchrl_ocwm.data.formats import Source, SourceError, open_source
 from torchrl_ocwm.data.formats.source import Format
 from torchrl_ocwm.envs.positions import hold_last_seen
 from torchrl_ocwm.envs.task import ActionRange, Task
 from torchrl_ocwm.envs.workspace import Workspace
-from torchrl_ocwm.files import whole_folder
 from torchrl_ocwm.images import ImageSize, image_shape
 from torchrl_ocwm.settings import Settings, SettingsError, setting
 
@@ -116,27 +116,20 @@ def import_dataset(source: str | Path, path: str | Path, settings: Importing | N
 
     Raises:
         SourceError: if the recordings cannot be read, or lack what every dataset has.
-        DatasetError: if there is a dataset already, or an episode cannot be stored.
+        DatasetError: if there is a dataset already, the folder cannot be written, or an episode cannot be stored.
         MissingPackageError: if a package for the format is missing, with the extra to install.
     """
     settings, path = settings or Importing(), Path(path)
-    _refuse_to_write(path)
-    recordings = Recordings(open_source(str(source), settings.format), settings)
-    task = recordings.task()
-    metadata = {"environment": task.name, "options": {}, "task": task.to_dict()}
-    with whole_folder(path) as draft:
+    with draft_of(path) as draft:
+        recordings = Recordings(open_source(str(source), settings.format), settings)
+        task = recordings.task()
+        metadata = {"environment": task.name, "options": {}, "task": task.to_dict()}
         first = recordings.records(0, task)
         with EpisodeDataset.create(draft, example=first[0], metadata=metadata) as dataset:
             dataset.append(first)
             for number in range(1, len(recordings)):
                 dataset.append(recordings.records(number, task))
     return EpisodeDataset.open(path)
-
-
-def _refuse_to_write(path: Path) -> None:
-    refuse_another(path)
-    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-        raise DatasetError(f"{path}: there is something else here; choose another folder")
 
 
 class Recordings:

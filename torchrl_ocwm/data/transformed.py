@@ -14,6 +14,7 @@ from torchrl.envs import Transform
 
 from torchrl_ocwm.data.convert import no_workspace, workspace_around
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
+from torchrl_ocwm.data.draft import draft_of
 from torchrl_ocwm.envs.workspace import Workspace
 
 _OF_THE_FILES = ("format", "version", "records", "episode_lengths", "checksums", "keys", "coverage")
@@ -30,6 +31,8 @@ def transform_dataset(
 ) -> EpisodeDataset:
     """Copy a dataset, each episode through a transform: for masks and positions that recordings lack, for instance.
 
+    If anything fails, there is no copy.
+
     Recordings that were imported without positions have no workspace either. Where the transform gives them positions,
     the workspace of the copy is the box around those of the first object, with as many axes, as
     :func:`~torchrl_ocwm.data.import_dataset` makes it.
@@ -43,7 +46,7 @@ def transform_dataset(
         metadata: What to keep in the index of the copy, beside what that of the dataset holds.
 
     Returns:
-        The copy, opened.
+        The copy, opened to read.
 
     Raises:
         DatasetError: if there is a dataset already, the folder cannot be written, what comes out of the transform is
@@ -69,16 +72,19 @@ def transform_dataset(
         workspace = no_workspace(example[_POSITION].shape[-1])  # until all positions are known
     if workspace is not None:
         kept["task"] = _task_in(dataset, workspace)
-    places = []
-    with EpisodeDataset.create(path, example=example[0], metadata={**kept, **metadata}) as copy:
+    path, places = Path(path), []
+    with (
+        draft_of(path) as draft,
+        EpisodeDataset.create(draft, example=example[0], metadata={**kept, **metadata}) as copy,
+    ):
         for number in range(len(dataset)):
             records = transform(dataset[number])
             copy.append(records)
             if fitted:
                 places.append(_seen(records))
         if places:
-            copy.annotate(task=_task_in(dataset, _workspace_around(torch.cat(places), copy.path)))
-    return copy
+            copy.annotate(task=_task_in(dataset, _workspace_around(torch.cat(places), path)))
+    return EpisodeDataset.open(path)
 
 
 def _adds_positions(dataset: EpisodeDataset, records: TensorDictBase) -> bool:

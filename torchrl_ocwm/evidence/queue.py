@@ -94,8 +94,9 @@ def work_off(
         while True:
             while len(at_work) < launcher.slots and (run := _next(left, done)):
                 left.remove(run)
-                commands = run.commands(root, how)
-                job = Job(run, root, commands, records[run.name], how.threads, PROGRAM)
+                # Kept as seen from the root: the folder of all runs may be moved.
+                record = replace(records[run.name], commands=tuple(run.commands(Path(), how)))
+                job = Job(run, root, run.commands(root, how), record, how.threads, PROGRAM)
                 at_work[launcher.submit(perform, job)] = run
             if not at_work:
                 break
@@ -129,7 +130,7 @@ def perform(job: Job, stop: Event, environment: Mapping[str, str]) -> None:
         RunFailedError: if a command fails or is stopped, or ends before all is done.
     """
     job.folder.mkdir(parents=True, exist_ok=True)
-    record = replace(job.record, commands=tuple(job.commands), commit=commit(), machine=machine())
+    record = replace(job.record, commit=commit(), machine=machine())
     before, start = record.seconds, time.monotonic()
 
     def note(done: bool = False) -> None:

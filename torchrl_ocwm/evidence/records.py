@@ -29,7 +29,7 @@ class Record:
         work: How much there was to do.
         seconds: Wall time, over all stops.
         done: Whether it is done.
-        commands: What did it.
+        commands: What did it, paths as seen from the folder of all runs.
         commit: Of the code that did it last.
         machine: That did it last.
     """
