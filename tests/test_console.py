@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -128,6 +129,18 @@ def test_without_hydra_one_line_names_the_extra() -> None:
     assert line == (
         "MissingPackageError: a recipe needs hydra, which is not installed: pip install 'torchrl-ocwm[recipes]'"
     )
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_while_packages_are_loaded_it_says_so_in_a_line(number: signal.Signals) -> None:
+    code = (
+        "import os, sys; from torchrl_ocwm import console\n"
+        f"console.import_module = lambda name: os.kill(os.getpid(), {int(number)})\n"
+        "console.main()"
+    )
+    done = python(code, "train")
+    assert done.returncode == 128 + number
+    assert done.stderr.split("\n") == ["", f"stopped by {number.name}; what has been written is whole", ""]
 
 
 def test_a_fault_of_ours_shows_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ import sys
 from importlib import import_module
 
 from torchrl_ocwm.errors import UserError
+from torchrl_ocwm.signals import ended_by_signals
 
 #: What there is to do → the module in ``torchrl_ocwm.recipes`` that does it, and what it is. To add one, add a row.
 COMMANDS = {
@@ -53,13 +54,14 @@ def run(command: str) -> None:
     """Run a recipe with the settings in ``sys.argv``.
 
     Raises:
-        SystemExit: with one line, if the extra ``recipes`` is not installed.
+        SystemExit: with one line, if the extra ``recipes`` is not installed, or at Ctrl-C while packages are loaded.
     """
     if command in FIRST_WORDS and (word := next(iter(sys.argv[1:]), "-")) and not _is_setting(word):
         quoted = word.replace("'", "\\'")
         sys.argv[1] = f"{FIRST_WORDS[command]}='{quoted}'"
     try:
-        recipe = import_module(f"torchrl_ocwm.recipes.{COMMANDS[command][0]}")
+        with ended_by_signals():  # it takes seconds
+            recipe = import_module(f"torchrl_ocwm.recipes.{COMMANDS[command][0]}")
     except UserError as error:
         sys.exit(f"{type(error).__name__}: {error}")
     try:
