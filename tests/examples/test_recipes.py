@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -17,12 +20,21 @@ from torchrl_ocwm.agents import Position
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def run(script: str, *arguments: str, fails: bool = False) -> str:
-    done = subprocess.run(
-        [sys.executable, str(EXAMPLES / script), *arguments], capture_output=True, text=True, check=False
-    )
-    assert (done.returncode != 0) == fails, done.stderr
-    return done.stderr if fails else done.stdout
+def run(script: str, *arguments: str) -> str:
+    """A recipe as on the command line, but in this process, which has imported everything already."""
+    printed = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        patch.setattr(sys, "argv", [script, *arguments])
+        runpy.run_path(str(EXAMPLES / script), run_name="__main__")
+    return printed.getvalue()
+
+
+def failure(script: str, *arguments: str) -> str:
+    """What a recipe says that ends with an error."""
+    command = [sys.executable, str(EXAMPLES / script), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode
+    return done.stderr
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +102,7 @@ def test_from_dataset_to_table(dataset: Path, tmp_path: Path) -> None:
     assert [row[1] for row in rows] == ["1", "1", "2", "1", "1"]
     assert "±" in rows[2][-1]
     for again in (f"checkpoint={pcp}", f"checkpoint=[{second},{second}]"):
-        error = run("evaluate.py", again, *more, fails=True)
+        error = failure("evaluate.py", again, *more)
         assert "which counts already; leave one of them out" in error
         assert "Traceback" not in error
     assert torchrl_ocwm.load_agent(pcp).agent.config.behaviours["reach"].goal == Position()
@@ -119,6 +131,6 @@ def test_agents_that_take_images_only(dataset: Path, tmp_path: Path) -> None:
     ],
 )
 def test_errors_are_one_message(script: str, arguments: tuple[str, ...], message: str, tmp_path: Path) -> None:
-    error = run(script, *arguments, *([f"output={tmp_path}"] if script != "collect.py" else []), fails=True)
+    error = failure(script, *arguments, *([f"output={tmp_path}"] if script != "collect.py" else []))
     assert message in error
     assert "Traceback" not in error
