@@ -10,6 +10,17 @@ from torchrl_ocwm.data.dataset import DatasetError, refuse_another
 from torchrl_ocwm.files import whole_folder
 
 
+def refuse_what_is_there(path: Path) -> None:
+    """Raise where a new dataset cannot be.
+
+    Raises:
+        DatasetError: if there is a dataset or something else already.
+    """
+    refuse_another(path)
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise DatasetError(f"{path}: there is something else here; choose another folder")
+
+
 @contextmanager
 def draft_of(path: Path) -> Iterator[Path]:
     """Make a dataset beside its place; it takes it when it is whole, and nothing of it stays if anything fails.
@@ -20,11 +31,9 @@ def draft_of(path: Path) -> Iterator[Path]:
     Raises:
         DatasetError: if there is a dataset or something else already, or the folder cannot be written.
     """
-    refuse_another(path)
+    refuse_what_is_there(path)
     with ExitStack() as stack:
         try:
-            if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-                raise DatasetError(f"{path}: there is something else here; choose another folder")
             draft = stack.enter_context(whole_folder(path))
         except OSError as error:
             raise DatasetError(f"{path}: cannot be made ({error.strerror}); choose another folder") from error

@@ -14,7 +14,7 @@ from torch.nn.functional import one_hot
 
 from torchrl_ocwm.data.convert import box, images, join_images, join_vectors, masks, no_workspace, workspace_around
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
-from torchrl_ocwm.data.draft import draft_of
+from torchrl_ocwm.data.draft import draft_of, refuse_what_is_there
 from torchrl_ocwm.data.formats import Source, SourceError, open_source
 from torchrl_ocwm.data.formats.source import Format
 from torchrl_ocwm.envs.positions import hold_last_seen
@@ -120,10 +120,11 @@ def import_dataset(source: str | Path, path: str | Path, settings: Importing | N
         MissingPackageError: if a package for the format is missing, with the extra to install.
     """
     settings, path = settings or Importing(), Path(path)
+    refuse_what_is_there(path)  # before all recordings are read
+    recordings = Recordings(open_source(str(source), settings.format), settings)
+    task = recordings.task()
+    metadata = {"environment": task.name, "options": {}, "task": task.to_dict()}
     with draft_of(path) as draft:
-        recordings = Recordings(open_source(str(source), settings.format), settings)
-        task = recordings.task()
-        metadata = {"environment": task.name, "options": {}, "task": task.to_dict()}
         first = recordings.records(0, task)
         with EpisodeDataset.create(draft, example=first[0], metadata=metadata) as dataset:
             dataset.append(first)
