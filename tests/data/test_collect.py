@@ -3,8 +3,10 @@
 import importlib
 import json
 import os
+import shutil
 import signal
 import time
+from typing import Any
 
 import pytest
 import torch
@@ -206,6 +208,29 @@ def test_folder_with_other_options(collected, no_collector, options):
     message = rf"{collected.path}: holds a dataset of 'reacher' with options \{{'horizon': 20, .*choose another folder"
     with pytest.raises(DatasetError, match=message):
         gather(collected.path, 1000, options=options)
+
+
+def rewritten(dataset: EpisodeDataset, **task: Any) -> None:
+    """Its task in the index, with something else in it or without it."""
+    file = dataset.path / "dataset.json"
+    index = json.loads(file.read_text())
+    index["task"] = {name: value for name, value in {**index["task"], **task}.items() if value is not None}
+    file.write_text(json.dumps(index))
+
+
+def test_a_dataset_from_before_a_setting_of_tasks_can_grow(tmp_path):
+    rewritten(gather(tmp_path / "data", 20), discrete=None)
+    assert len(gather(tmp_path / "data", 40)) == 2
+
+
+def test_folder_with_another_task_says_what_differs(collected, tmp_path):
+    shutil.copytree(collected.path, tmp_path / "data")
+    rewritten(EpisodeDataset.open(tmp_path / "data"), objects=["ball"])
+    for _ in range(2):  # it is not kept open
+        with pytest.raises(
+            DatasetError, match=r"another task \(objects: \['ball'\] there, \['finger'\] here\); choose"
+        ):
+            gather(tmp_path / "data", 1000)
 
 
 def test_index_counts_the_episodes_of_each_policy(tmp_path):

@@ -31,7 +31,7 @@ from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.registry import recorded
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.processes import Make, Worker, make_worker
-from torchrl_ocwm.settings import SettingsError
+from torchrl_ocwm.settings import SettingsError, differences
 
 
 class CollectionError(UserError, RuntimeError):
@@ -262,11 +262,23 @@ def _open_if_there(path: Path, source: dict[str, Any]) -> EpisodeDataset | None:
         refuse_another(path)
         return None
     dataset = EpisodeDataset.open(path, write=True)  # it may have been killed before the first episode
-    there = {key: dataset.metadata.get(key) for key in source}
-    if there != json.loads(json.dumps(source)):
-        dataset.close()
-        raise DatasetError(
-            f"{path}: holds a dataset of {there['environment']!r} with options {there['options']}, not of "
-            f"{source['environment']!r} with {source['options']}; choose another folder"
-        )
+    with ExitStack() as opened:
+        opened.callback(dataset.close)
+        if different := _different(dataset, source):
+            raise DatasetError(f"{path}: holds a dataset {different}; choose another folder")
+        opened.pop_all()
     return dataset
+
+
+def _different(dataset: EpisodeDataset, source: dict[str, Any]) -> str:
+    """Of what else a dataset is; nothing, if episodes of the same environment can be added."""
+    index, here = dataset.metadata, json.loads(json.dumps(source))
+    if any(index.get(key) != here[key] for key in ("environment", "options")):
+        return (
+            f"of {index.get('environment')!r} with options {index.get('options')}, not of {here['environment']!r} with "
+            f"{here['options']}"
+        )
+    there = dataset.task  # with the defaults of what was added to tasks later
+    if there == (task := Task.from_dict(here["task"])):
+        return ""
+    return f"of another task ({differences(there, task, 'there', 'here')})"
