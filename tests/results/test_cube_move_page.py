@@ -130,6 +130,36 @@ def test_page_of_the_online_run() -> None:
     assert unchecked(ONLINE, sentences) == []
 
 
+OFFLINE = "cube_move/offline"
+#: What was done: no file beside the page has these numbers.
+STATED_OFFLINE = ["At commit acea4f6 on 2026-11-26", "PyTorch 2.13.0 on the CPU", "took 122 minutes"]
+
+
+def offline() -> list[str]:
+    """The data of another agent."""
+    numbers, made = report(OFFLINE), settings(OFFLINE, "focus_pcp_seed_0")
+    steps = max(curve(RESULTS / ONLINE / "focus_lcp_seed_0_steps.csv").values())
+    scores = curve(RESULTS / OFFLINE / "focus_pcp_seed_0.csv")
+    goals, side, updates = len(numbers.goals), math.isqrt(len(numbers.goals)), made["training"]["updates"]
+    expected, real = (mean(numbers, "focus_pcp", metric, 100) for metric in ("imagined_distance", "final_distance"))
+    assert made["training"]["updates"] == settings(ONLINE, "focus_lcp_seed_0")["training"]["updates"] == max(scores)
+    return [
+        f"{goals} goals, a {side} × {side} grid over the workspace; {numbers.settings['episode_steps']} steps each",
+        f"expects to end {expected:.1f} cm from the goal, and ends {real:.1f} cm from it",
+        f"it scored {mean(report('cube_move'), 'focus_pcp', 'final_score'):.2f}]",
+        f"this data is {steps:,.0f} steps in which",
+        f"is {scores[2500]:.2f} after 2,500 updates, {scores[5000]:.2f} after 5,000 and",
+        f"{scores[updates]:.2f} in the end",
+        f"{updates:,} updates with one thread",
+    ]
+
+
+def test_page_of_the_offline_run() -> None:
+    sentences = [*offline(), *STATED_OFFLINE]
+    assert missing(OFFLINE, sentences) == []
+    assert unchecked(OFFLINE, sentences) == []
+
+
 def test_online_scores_of_the_readme() -> None:
     scores = [mean(report(ONLINE), row, "final_score") for row in ("focus_lcp", "focus_lcp, image goals")]
     assert f"alone scores {scores[0]:.2f}, with images {scores[1]:.2f}" in " ".join(
