@@ -8,15 +8,17 @@ import pkgutil
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
 import torchrl_ocwm
 from torchrl_ocwm import check
+from torchrl_ocwm.console import COMMANDS
 from torchrl_ocwm.envs import ENVIRONMENTS
 from torchrl_ocwm.envs.missing import missing, needs
 
@@ -195,16 +197,31 @@ def test_make_goes_on_with_a_version_that_it_takes(tmp_path: Path) -> None:
     assert "makes an environment" in run_make(tmp_path, "3.10").stdout
 
 
-def test_make_leaves_no_environment_of_another_python_and_needs_room_for_it() -> None:
-    def says(*arguments: str) -> str:
-        # Not the options of the make that runs this test.
-        environment = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
-        command = ["make", *arguments]
-        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+def make(*arguments: str) -> str:
+    """What it prints, without the options of the make that runs these tests."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    command = ["make", *arguments]
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
 
-    assert "its packages need 999999: not tested with it" in says("test-python-3.10", "PYTHON_SPACE=999999")
-    assert "not on this machine: not tested with it" in says("test-python-0.0", "PYTHON_SPACE=0")
-    assert says("-n", ".venv-0.0/.tested", "FOUND=python").splitlines()[-1] == "rm -r .venv-0.0"
+
+def test_make_leaves_no_environment_of_another_python_and_needs_room_for_it() -> None:
+    assert "its packages need 999999: not tested with it" in make("test-python-3.10", "PYTHON_SPACE=999999")
+    assert "not on this machine: not tested with it" in make("test-python-0.0", "PYTHON_SPACE=0")
+    assert make("-n", ".venv-0.0/.tested", "FOUND=python").splitlines()[-1] == "rm -r .venv-0.0"
+
+
+def test_the_demonstration_is_made_of_recipes(compose: Callable[..., Any]) -> None:
+    """On half scripted, half random data, with a thread for each core."""
+    said = make("-n", "demo", "DEMO=outputs/nothing", "STEPS=90", "UPDATES=7").replace("\\\n", " ")
+    said = re.sub(r"\$\(\((\d+) / 2\)\)", lambda half: str(int(half[1]) // 2), said)
+    commands = [line.split()[1:] for line in said.splitlines() if re.match(r"\S*/ocwm ", line)]
+    done = [compose(COMMANDS[command][0], *settings) for command, *settings in commands]
+    scripted, random, trained, evaluated = done
+    asked = [(one.policy, one.steps, one.workers) for one in (scripted, random)]
+    assert asked == [("scripted", 45, 2), ("random", 90, 2)]
+    assert (trained.training.updates, trained.training.threads) == (7, 2)
+    assert scripted.dataset == random.dataset == trained.dataset
+    assert str(evaluated.checkpoint) == f"{trained.output}/checkpoint.zip"
 
 
 @pytest.mark.parametrize("extra", ["robosuite", "dm-control"])

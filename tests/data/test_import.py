@@ -384,6 +384,13 @@ def test_what_every_dataset_has_is_asked_for_with_what_there_is(tmp_path: Path) 
         made(tmp_path, dict(sorted(arrays.items())))
 
 
+def test_a_place_that_is_taken_is_refused_before_recordings_are_read(tmp_path: Path) -> None:
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "file").touch()
+    with pytest.raises(DatasetError, match="there is something else here"):
+        import_dataset(tmp_path / "nowhere", tmp_path / "taken")
+
+
 def test_places_that_hold_nothing_or_something_else(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(SourceError, match="none of the formats hdf5, npz, minari, lerobot"):

@@ -113,6 +113,14 @@ def test_a_dataset_of_several_policies_is_collected_in_their_shares(compose: Cal
     assert [(one.policy, one.steps) for one in collected] == [("scripted", 76), ("random", 101)]
 
 
+@pytest.mark.parametrize("env", ["shelf_place", "pick_place"])
+def test_actions_of_meta_world_last_four_control_steps(env: str) -> None:
+    for size, image in (("cpu", 32), ("paper", 64)):
+        [data] = [run for run in runs("table", env=env, size=size) if run.kind == "datasets"]
+        options = data.content["options"]
+        assert (options.action_repeat, options.horizon, options.image_size) == (4, 60, image)
+
+
 def test_baselines_have_both_weights() -> None:
     rows = {row.name: row for row in FIGURES["table"].rows}
     for agent in ("dreamer", "focus"):

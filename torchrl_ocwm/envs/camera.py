@@ -225,6 +225,5 @@ class Camera:
 
     def __del__(self) -> None:
         # Python may collect it in another thread, which cannot free what is OpenGL's.
-        mine = threading.current_thread() is self.__dict__.get("_thread")
-        if mine and not sys.is_finalizing() and "_gl" in self.__dict__:
+        if not sys.is_finalizing() and self.__dict__.get("_thread") is threading.current_thread():
             self.close()

@@ -226,7 +226,7 @@ _CUBE = Setup(
     episode_steps=100,
     updates=5.0,
 )
-# The hand starts 13 control steps above the object: one per action is more than imagination looks ahead.
+# The hand starts high above the object: with one control step per action, imagination does not look that far ahead.
 _META_WORLD = Setup(
     policies=_MOSTLY_SCRIPTED,
     options={"horizon": 60, "action_repeat": 4},
