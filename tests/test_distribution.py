@@ -108,6 +108,7 @@ def test_what_an_index_shows(wheel: Path) -> None:
     assert about["Summary"]
     assert about["Author"]
     assert "Typing :: Typed" in about.get_all("Classifier", [])
+    assert "Paper, https://arxiv.org/abs/2409.12005" in about.get_all("Project-URL", [])
     assert {"recipes", "all"} <= {*about.get_all("Provides-Extra", [])}
 
 
@@ -118,7 +119,7 @@ def programs(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(folder, symlinks=os.name != "nt")
     programs = folder / ("Scripts" if os.name == "nt" else "bin")
     install = ["-m", "pip", "--python", str(programs / "python"), "install", "--no-deps", "--no-index", "--quiet"]
-    subprocess.run([sys.executable, *install, str(wheel)], check=True)
+    subprocess.run([sys.executable, *install, str(wheel)], env=outside(), check=True)
     where = [programs / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
     found = subprocess.run(where, capture_output=True, text=True, check=True).stdout.strip()
     there = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
@@ -126,12 +127,14 @@ def programs(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return programs
 
 
+def outside() -> dict[str, str]:
+    """Variables with which nothing of the checkout is found."""
+    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+
+
 def run(program: Path, *arguments: str, folder: Path) -> str:
     """What a program prints, outside of the checkout."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(
-        [program, *arguments], cwd=folder, env=environment, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([program, *arguments], cwd=folder, env=outside(), capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
