@@ -1,6 +1,6 @@
-"""The rows compute what they computed in release 0.1: losses of three updates, written down then.
+"""The rows compute what they computed in release 0.1, but for goal latents, which have had one length since.
 
-Those of ``focus_lcp`` are of the commit that gave all goal latents one length.
+Losses of three updates in float64, as commit caf7a5f gives them. In float32 its losses were those of 0.1, bit for bit.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ GOLDEN = json.loads((Path(__file__).parent / "golden.json").read_text())
 
 
 @pytest.mark.parametrize("name", GOLDEN)
+@pytest.mark.usefixtures("float64")
 def test_losses_are_those_of_before(name: str) -> None:
     torch.manual_seed(3)
     agent = build_agent(name, reacher_task(), "debug")
@@ -28,5 +29,5 @@ def test_losses_are_those_of_before(name: str) -> None:
         torch.manual_seed(10 + update)
         losses = stepper.step(None, random_records(reacher_task(), 2, 8, seed=update))
         got = {key: float(value) for key, value in losses.items() if key.startswith("loss_")}
-        # Another processor adds up in another order.
-        assert got == pytest.approx(expected, rel=1e-3, abs=1e-4)
+        # Another processor adds up in another order, and the optimiser makes steps of what is nothing but rounding.
+        assert got == pytest.approx(expected, rel=1e-4, abs=1e-6)

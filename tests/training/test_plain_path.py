@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor, nn
@@ -19,15 +17,6 @@ from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_stepper
 
 UPDATES = 20
-
-
-@pytest.fixture
-def float64(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """In float32 rounding decides sooner or later which state is drawn, and the two part."""
-    monkeypatch.setattr(Tensor, "float", Tensor.double)
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(torch.float32)
 
 
 def make_plain(patch: pytest.MonkeyPatch) -> None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
+from torch import Tensor, cdist, nn
+from torch.autograd.function import once_differentiable
 
 
 def particle_entropy(particles: Tensor, *, k: int = 12, clip: float = 0.0, chunk: int = 1024) -> Tensor:
     """What each particle adds to the entropy of all: how far it lies from its k nearest neighbours (APT, FOCUS).
 
     log(1 + the mean of max(d − clip, 0) over the distances d to the k nearest others). Gradients go through the
-    particle and its neighbours. Distances are computed again in the backward pass, so that memory grows with N, not N².
+    particle and its neighbours. Memory grows with N, not N².
 
     Args:
         particles: ``[..., N, F]``; all in the last but one dimension are compared.
@@ -28,17 +30,37 @@ def particle_entropy(particles: Tensor, *, k: int = 12, clip: float = 0.0, chunk
         >>> particle_entropy(torch.tensor([[0.0], [1.0], [4.0]]), k=1).expm1()
         tensor([1., 1., 3.])
     """
-    particles = particles.float()
     count = min(k, particles.shape[-2] - 1)
+    nearest = _NearestDistances.apply(particles.float(), count, chunk)
+    return ((nearest - clip).clamp_min(0).sum(-1) / max(count, 1)).log1p()
 
-    def distance(part: Tensor) -> Tensor:
-        nearest = torch.cdist(part, particles).topk(count + 1, largest=False).values[..., 1:]  # the first is itself
-        return (nearest - clip).clamp_min(0).sum(-1) / max(count, 1)
 
-    parts = [
-        checkpoint(distance, part, use_reentrant=False, preserve_rng_state=False) for part in particles.split(chunk, -2)
-    ]
-    return torch.cat(parts, -1).log1p()
+class _NearestDistances(torch.autograd.Function):
+    """Distances ``[..., N, k]`` of particles ``[..., N, F]`` from their nearest others.
+
+    Which these are is found once, and kept for the backward pass: finding them takes longer than the distances.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, particles: Tensor, k: int, chunk: int) -> Tensor:
+        found = [cdist(part, particles).topk(k + 1, largest=False) for part in particles.split(chunk, -2)]
+        distances, index = (torch.cat([one[i][..., 1:] for one in found], -2) for i in (0, 1))  # the first is itself
+        ctx.save_for_backward(particles, distances, index)
+        ctx.chunk = chunk
+        return distances
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        particles, distances, index = ctx.saved_tensors
+        # d = |x − y| has the gradient (x − y) / d by x, and the negative of it by y.
+        pull = torch.where(distances > 0, gradient / distances, 0)
+        own, others = [], torch.zeros_like(particles)
+        for x, weight, nearest in zip(*(one.split(ctx.chunk, -2) for one in (particles, pull, index)), strict=True):
+            weights = x.new_zeros(*x.shape[:-1], particles.shape[-2]).scatter(-1, nearest, weight)
+            own.append(x * weight.sum(-1, keepdim=True) - weights @ particles)
+            others = others + particles * weights.sum(-2).unsqueeze(-1) - weights.mT @ x
+        return torch.cat(own, -2) + others, None, None
 
 
 class ParticleEntropy(nn.Module):
