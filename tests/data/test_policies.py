@@ -97,13 +97,15 @@ def test_bad_time_constants(shortest, longest):
         SmoothRandomPolicy(2, shortest=shortest, longest=longest)
 
 
-def scripted(policy: ScriptedPolicy, steps: int, batch: int, action: float) -> TensorDict:
-    """``[T, B]`` what the policy wrote, with a scripted action that is always the same."""
+def scripted(
+    policy: ScriptedPolicy, steps: int, batch: int, action: float, *, resets: tuple[int, ...] = (0,)
+) -> TensorDict:
+    """``[T, B]`` what the policy wrote, the scripted action being always the same, with starts at the given steps."""
     tensordict = TensorDict({"is_init": torch.zeros(batch, 1, dtype=torch.bool)}, [batch])
     tensordict["scripted_action"] = torch.full((batch, policy.random.action_dim), action)
     written = []
     for step in range(steps):
-        tensordict["is_init"] = torch.full((batch, 1), step == 0)
+        tensordict["is_init"] = torch.full((batch, 1), step in resets)
         written.append(policy(tensordict).clone())
     return torch.stack(written)
 
@@ -135,6 +137,16 @@ def test_noise_on_scripted_actions():
     assert level.mean().item() == pytest.approx(0.5, abs=0.05)
     deviation = (written["action"] - 0.5) / written["exploration", "noise"]
     torch.testing.assert_close(deviation, (0.1 * level).expand_as(deviation), atol=1e-3, rtol=0)
+
+
+def test_each_episode_draws_its_own_noise_and_whether_it_begins_with_a_stretch():
+    torch.manual_seed(0)
+    written = scripted(ScriptedPolicy(1, random_share=0.5, stretch=1e6), 4, 1000, 0.5, resets=(0, 2))
+    for name in ("level", "in_stretch"):
+        first, still, second, later = written["exploration", name].float().squeeze(-1)
+        assert torch.equal(first, still)
+        assert torch.equal(second, later)
+        assert abs(torch.corrcoef(torch.stack([first, second]))[0, 1]) < 0.15, name
 
 
 def test_noise_does_not_leave_the_bounds():

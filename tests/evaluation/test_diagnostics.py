@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -223,6 +224,14 @@ class TestGoalLatents:
         for name, (goals, latents) in expected.items():
             torch.testing.assert_close(pairs[name][0], goals)
             torch.testing.assert_close(pairs[name][1], latents)
+
+    def test_frames_show_the_object_in_question(self) -> None:
+        task = replace(reacher_task(), objects=("finger", "thumb"))
+        records = random_records(task, 4, 3)
+        records["next", "object_visible"][:, 1, 1] = False
+        _, positions = latent_pairs(build_agent("focus_lcp", task, size="debug").model, records, object_index=1)
+        seen = records["next", "object_position"][:, [0, 2], 1].flatten(0, 1)
+        torch.testing.assert_close(positions.sort(0).values, seen.sort(0).values)
 
     def test_seed_chooses_the_frames(self, make_agent: Any) -> None:
         model, records = make_agent("focus_lcp").model, random_records(reacher_task(), 5, 5)
