@@ -238,6 +238,14 @@ def test_an_agent_remembers_and_sees_what_it_did(play: Callable[..., Session], m
     assert len(actions) == len(calls) - 1 == 4
 
 
+def test_an_agent_acts_without_exploration(play: Callable[..., Session]) -> None:
+    session = play()
+    assert session.policy is not None
+    latent = session._now["latent"].select("state", "belief", "goal")
+    mean = session.policy.behaviour.actor[0](TensorDict({"latent": latent}, [1]))["loc"]
+    torch.testing.assert_close(session._now["action"], mean)
+
+
 def test_an_episode_begins_without_memory(play: Callable[..., Session]) -> None:
     session = play("dreamer_pcp")
     session.step()
