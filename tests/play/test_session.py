@@ -478,6 +478,13 @@ def test_who_can_act(make_agent: Callable[..., Agent], tmp_path: Path) -> None:
         assert session.policy.agent is players[0].agent
 
 
+def test_an_agent_acts_in_its_task() -> None:
+    agent = build_agent("dreamer_pcp", make_task("reacher", image_size=32), "debug")
+    with Player("mine", "reacher", agent).session() as session:
+        assert session.env.image_size == 32
+        session.step()
+
+
 def test_who_cannot() -> None:
     with pytest.raises(CheckpointError, match=r"no_such\.zip: no such checkpoint"):
         find_players(["no_such.zip"])

@@ -61,9 +61,9 @@ def envs(task: Task) -> Iterator[EvaluationEnvs]:
 def evaluate(command: Callable[..., str], tmp_path: Path) -> Callable[..., tuple[Tensor, dict[str, Any]]]:
     """The goals, and what was found for each of them in every row, in their order."""
 
-    def run(file: Path) -> tuple[Tensor, dict[str, Any]]:
+    def run(file: Path, *more: str) -> tuple[Tensor, dict[str, Any]]:
         small = (f"goals={GOALS}", f"episode_steps={STEPS}", "workers=0", f"envs={GOALS}", "video_goals=0")
-        command("evaluate", f"checkpoint={file}", *small, "image_goals=true", "output=out")
+        command("evaluate", f"checkpoint={file}", *small, "image_goals=true", "output=out", *more)
         results = json.loads((tmp_path / "out" / "results.json").read_text())
         rows = {name: row["per_goal"][0] for name, row in results["agents"].items()}
         return torch.tensor(results["goals"]), rows
@@ -91,6 +91,18 @@ def test_scores_and_errors(evaluate: Callable[..., Any], agent: Callable[..., Pa
             assert rows[name]["entity_error"] == pytest.approx(episodes["entity_error"].mean(1).tolist(), abs=1e-5)
             imagined = imagined_distance(policy.behaviour, episodes["latent"][:, 0], goals, STEPS, object_index=1)
             assert rows[name]["imagined_distance"] == pytest.approx(imagined.tolist(), abs=1e-5)
+
+
+def test_scores_of_another_behaviour(
+    evaluate: Callable[..., Any], agent: Callable[..., Path], envs: EvaluationEnvs
+) -> None:
+    file = agent("focus_lcp", **{"behaviours.other": AGENTS["focus_lcp"].behaviours["reach"]})
+    goals, rows = evaluate(file, "behaviour=other")
+    (row,) = (row for name, row in rows.items() if name.endswith(", other"))
+    both = [envs.run(load_agent(file, behaviour=name), goals)["object_position_true"] for name in ("other", "reach")]
+    other, reach = ((positions[:, -1, 0] - goals).norm(dim=-1) for positions in both)
+    assert (other - reach).abs().min() > 1e-4
+    assert row["final_distance"] == pytest.approx(other.tolist(), abs=1e-5)
 
 
 def test_the_return_beside_that_which_is_predicted(
