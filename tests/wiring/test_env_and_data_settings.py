@@ -18,7 +18,7 @@ from rows import shows
 import torchrl_ocwm.envs
 from torchrl_ocwm.data import Collection, collect
 from torchrl_ocwm.data.dataset import EpisodeDataset
-from torchrl_ocwm.envs import ENVIRONMENTS, make_env, make_task
+from torchrl_ocwm.envs import ENVIRONMENTS, PositioningEnv, make_env, make_task
 from torchrl_ocwm.envs.positioning import TARGET_COLOUR
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import reacher_task
@@ -97,6 +97,21 @@ def test_labelled_frames(mask_scale: int) -> None:
                 model.mat_rgba[model.geom("finger").matid] = (0, 1, 0, 1)
             assert true._observe(true.data)["object_visible"].tolist() == [True]
             assert scene._observe(scene.data)["object_visible"].tolist() == [False]
+
+
+def test_each_object_in_turn_is_shown_to_learn_its_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("cv2")
+    shown: list[int] = []
+    show = PositioningEnv.goal_observation
+
+    def watched(scene: Any, place: np.ndarray, object_index: int) -> Any:
+        shown.append(object_index)
+        return show(scene, place, object_index)
+
+    monkeypatch.setattr(PositioningEnv, "goal_observation", watched)
+    with simulator("cube_move", mask_scale=5, objects=("cube", "distractor"), labelled_frames=3) as scene:
+        assert shown == [0, 1, 0]
+        assert scene._observe(scene.data)["object_visible"].tolist() == [True, True]
 
 
 def test_environments_that_learnt_colours_start_as_others_do() -> None:

@@ -16,7 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.checkpoint import CheckpointError
 from torchrl.record.loggers import CSVLogger
 
-from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
+from torchrl_ocwm.agents import AGENTS, EXPLORERS, SIZES, Agent, build_agent
 from torchrl_ocwm.agents.archive import Archive
 from torchrl_ocwm.data import EpisodeDataset
 from torchrl_ocwm.devices import DeviceError
@@ -217,18 +217,21 @@ def test_learning_rates_fall(run: Callable[..., Run]) -> None:
 
 @shows("Training.target_rate")
 @pytest.mark.parametrize("rate", [0.02, 0.5, 1.0])
-def test_the_slow_critic_follows(rate: float) -> None:
-    agent = build_agent("dreamer_pcp", TASK, change(SIZES["debug"], {"learning.value_lr": 1.0}))
-    critic, stepper = agent.behaviour().loss.value_loss, make_stepper(agent, Training(target_rate=rate))
-    before = critic.target_value_model_params.clone()
+def test_the_slow_critic_of_each_behaviour_follows(rate: float) -> None:
+    row = AGENTS["dreamer_pcp"].and_behaviours(explore=EXPLORERS["plan2explore"])
+    agent = build_agent(row, TASK, change(SIZES["debug"], {"learning.value_lr": 1.0}))
+    critics = [agent.behaviour(name).loss.value_loss for name in agent.behaviours]
+    stepper = make_stepper(agent, Training(target_rate=rate))
+    befores = [critic.target_value_model_params.clone() for critic in critics]
     stepper.step(None, random_records(TASK, 2, 5))
-    moved = 0.0
-    for key, slow in critic.target_value_model_params.items(True, True):
-        if isinstance(slow, torch.Tensor) and slow.is_floating_point():
-            new = critic.value_model_params[key].detach()
-            torch.testing.assert_close(slow, (1 - rate) * before[key] + rate * new)
-            moved = max(moved, float((new - before[key]).abs().max()))
-    assert moved > 0.01
+    for critic, before in zip(critics, befores, strict=True):
+        moved = 0.0
+        for key, slow in critic.target_value_model_params.items(True, True):
+            if isinstance(slow, torch.Tensor) and slow.is_floating_point():
+                new = critic.value_model_params[key].detach()
+                torch.testing.assert_close(slow, (1 - rate) * before[key] + rate * new)
+                moved = max(moved, float((new - before[key]).abs().max()))
+        assert moved > 0.01
 
 
 @shows("Training.loggers")
