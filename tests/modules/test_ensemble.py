@@ -73,7 +73,19 @@ def test_disagreement_by_hand() -> None:
     torch.testing.assert_close(log, torch.tensor([[2.0], [1e-6]]).log())
 
 
-def test_agreement_has_a_finite_gradient() -> None:
+@pytest.mark.parametrize("log", [False, True])
+def test_agreement_has_a_finite_gradient(log: bool) -> None:
     predictions = torch.ones(3, 2, 4, requires_grad=True)
-    disagreement(predictions, log=True).sum().backward()
+    disagreement(predictions, log=log).sum().backward()
     assert predictions.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_gradients_are_those_of_the_variance(log: bool) -> None:
+    predictions = (3 + torch.randn(5, 6, 2, 4)).requires_grad_()
+    variance = predictions.var(0)
+    expected = variance.sqrt().mean(-1, keepdim=True).log() if log else variance.mean(-1, keepdim=True)
+    got, weights = disagreement(predictions, log=log), torch.randn(6, 2, 1)
+    torch.testing.assert_close(got, expected)
+    gradients = [torch.autograd.grad((value * weights).sum(), predictions)[0] for value in (got, expected)]
+    torch.testing.assert_close(*gradients)

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Cube move from nothing: an agent that collects its own data, in rounds, after scripted and random steps; then two others
-# on the same data. One thread each, two runs at a time. Run from the repository root; what is done already is not done
-# again. The numbers in README.md were made by the script of commit c1b4e61, in which two agents acted in turn.
+# Cube move from nothing: two agents that collect their own data, in rounds, after scripted and random steps; then a third
+# on the data of one of them. One thread each, two runs at a time. Run from the repository root; what is done already is
+# not done again. The numbers in README.md were made by the script of commit c1b4e61, in which two agents acted in turn.
 # Small images make updates cheap.
 # On a GPU: SIZE=paper IMAGE=64 FINER=3 UPDATES=50000 STEPS=300000 ROUNDS=8 GOALS=100 DEVICE=cuda \
 #   docs/results/cube_move/run.sh
@@ -18,21 +18,18 @@ settings="size=$size training.updates=$total training.eval_interval=$((updates /
 run() {
   echo "$runs/$1/$size/seed_0"
 }
-online() {  # agent
-  python examples/train_online.py agent="$1" env=cube_move $settings dataset=$data output="$(run "$1")" \
+online() {  # agent, dataset
+  python examples/train_online.py agent="$1" env=cube_move $settings dataset="$2" output="$(run "$1")" \
     env.options.image_size="$image" env.options.mask_scale="$finer" env.options.horizon=100 \
     "online.seed_policy=[scripted,random]" "online.seed_steps=[$((steps * 25 / 32)),$((steps * 7 / 32))]" \
     online.seed_updates="$updates" online.round_episodes=$episodes \
     online.update_ratio="$(awk "BEGIN {print $updates / (200 * $episodes)}")"
 }
-offline() {  # agent
-  python examples/train_offline.py agent="$1" env=cube_move $settings dataset=$data output="$(run "$1")"
-}
 
-online focus_lcp
-offline focus_pcp &
-offline dreamer
+online focus_pcp ${data}_focus_pcp &
+online focus_lcp $data
 wait
+python examples/train_offline.py agent=dreamer env=cube_move $settings dataset=$data output="$(run dreamer)"
 
 for agent in dreamer focus_pcp focus_lcp; do
   cp "$(run $agent)/config.yaml" $here/${agent}_seed_0.yaml
