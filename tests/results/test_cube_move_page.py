@@ -6,6 +6,7 @@ import json
 import math
 
 import pytest
+import torch
 from reading import RESULTS, ROOT, curve, diagnosis, mean, missing, report, settings, unchecked
 
 #: What was done, or what the paper says: no file beside the page has these numbers.
@@ -98,33 +99,48 @@ def test_page() -> None:
 
 ONLINE = "cube_move/online"
 #: What was done: no file beside the page has these numbers.
-STATED_ONLINE = ["At commit 45c8d50 on 2026-11-25", "PyTorch 2.13.0 on the CPU", "took 91 minutes"]
+STATED_ONLINE = [
+    "at commit 45c8d50 on 2026-11-25 (Intel Xeon)",
+    "rounds and updates took 91 minutes",
+    "at commit edf6851 on 2026-11-26 (AMD EPYC): 83 minutes",
+    "PyTorch 2.13.0 on the CPU",
+]
+ROUNDS = ("scripted and random data", "the first round", "the second", "the third", "the fourth")
 
 
 def online() -> list[str]:
     """Rounds of acting and training in one command."""
     numbers, before = report(ONLINE), report("cube_move")
-    made = settings(ONLINE, "focus_lcp_seed_0")
-    first, updates = made["online"]["seed_updates"], made["training"]["updates"]
-    scores = curve(RESULTS / ONLINE / "focus_lcp_seed_0.csv")
-    steps = curve(RESULTS / ONLINE / "focus_lcp_seed_0_steps.csv")
-    *rounds, last = [f"{score:.2f}" for update, score in scores.items() if update > first]
+    runs = [settings(ONLINE, f"focus_{name}_seed_0") for name in ("lcp", "pcp")]
+    ((updates, first),) = {(run["training"]["updates"], run["online"]["seed_updates"]) for run in runs}
+    files = [RESULTS / ONLINE / f"focus_{name}_seed_0.csv" for name in ("lcp", "pcp")]
+    curves = [curve(file) for file in (*files, RESULTS / "cube_move" / "focus_pcp_seed_0.csv")]
+    after = [updates - (len(ROUNDS) - 1 - number) * (updates - first) // (len(ROUNDS) - 1) for number in range(5)]
+    lines = [
+        f"| {name} | {' | '.join(f'{one[at]:.2f}' for one in curves)} |" for name, at in zip(ROUNDS, after, strict=True)
+    ]
     rows = ("focus_lcp", "focus_lcp, image goals")
     assert all(mean(numbers, row, "final_score") > mean(before, row, "final_score") for row in rows)
     was = " and ".join(f"{mean(before, row, 'final_score'):.2f}" for row in rows)
+    now, then = (one.rows["focus_pcp"].seeds[0]["final_score"] for one in (numbers, before))
+    assert torch.equal(numbers.goals, before.goals)
+    error = float((now - then).std()) / len(now) ** 0.5
+    expected, real = (mean(numbers, "focus_pcp", metric, 100) for metric in ("imagined_distance", "final_distance"))
+    (steps,) = {max(curve(file.with_name(f"{file.stem}_steps.csv")).values()) for file in files}
     goals, side = len(numbers.goals), math.isqrt(len(numbers.goals))
     return [
+        *lines,
         f"{goals} goals, a {side} × {side} grid over the workspace; {numbers.settings['episode_steps']} steps each",
-        f"Before, the scores were {was}",
-        f"After {first:,} updates on the scripted and random data the score on ten landmark goals is "
-        f"{scores[first]:.2f}",
-        f"After the rounds it is {', '.join(rounds)} and {last}",
-        f"the dataset has {max(steps.values()):,.0f} steps",
+        f"when its scores were {was}",
+        f"FOCUS + PCP has {now.mean():.2f}, and had {then.mean():.2f}",
+        f"over the {goals} goals its standard error is {error:.2f}",
+        f"expects to end {expected:.1f} cm off on average, where it is {real:.1f}",
+        f"either dataset has {steps:,.0f} steps",
         f"{updates:,} updates with one thread",
     ]
 
 
-def test_page_of_the_online_run() -> None:
+def test_page_of_the_online_runs() -> None:
     sentences = [*online(), *STATED_ONLINE]
     assert missing(ONLINE, sentences) == []
     assert unchecked(ONLINE, sentences) == []
@@ -161,7 +177,7 @@ def test_page_of_the_offline_run() -> None:
 
 
 def test_online_scores_of_the_readme() -> None:
-    scores = [mean(report(ONLINE), row, "final_score") for row in ("focus_lcp", "focus_lcp, image goals")]
-    assert f"alone scores {scores[0]:.2f}, with images {scores[1]:.2f}" in " ".join(
-        (ROOT / "README.md").read_text().split()
-    )
+    rows = ("focus_lcp", "focus_lcp, image goals", "focus_pcp")
+    lcp, images, pcp = (f"{mean(report(ONLINE), row, 'final_score'):.2f}" for row in rows)
+    text = " ".join((ROOT / "README.md").read_text().split())
+    assert f"`focus_lcp` scores {lcp}, with images {images}, `focus_pcp` {pcp}" in text
