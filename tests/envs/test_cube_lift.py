@@ -37,6 +37,14 @@ def test_positions_have_the_height_above_the_start(env: CubeLift) -> None:
     assert middle == pytest.approx(np.array([0.1, -0.1, 0.15]), abs=1e-6)
 
 
+def test_a_moved_cube_is_at_rest(env: CubeLift) -> None:
+    env.reset(seed=1)
+    speed = env.model.joint("cube_joint0").dofadr[0]
+    env.data.qvel[speed : speed + 6] = 1.0
+    env.move_object((0.1, -0.1, 0.15))
+    assert not env.data.qvel[speed : speed + 6].any()
+
+
 def test_position_error_of_a_free_cube(env: CubeLift) -> None:
     """Measured over 57 poses: median 0.7 mm, 95th percentile 1.5 mm."""
     env.reset(seed=12)
