@@ -146,6 +146,39 @@ def test_page_of_the_online_runs() -> None:
     assert unchecked(ONLINE, sentences) == []
 
 
+COLOURS = "cube_move/colours"
+#: What was done: no file beside the page has these numbers.
+STATED_COLOURS = ["at commit edf6851 on 2026-11-26", "PyTorch 2.13.0 on the CPU", "took 100 minutes"]
+
+
+def colours() -> list[str]:
+    """Masks by colour, beside those of the simulator."""
+    numbers, true, made = report(COLOURS), report(ONLINE), settings(COLOURS, "focus_lcp_seed_0")
+    assert made["env"]["options"]["labelled_frames"] == 5
+    updates, first = made["training"]["updates"], made["online"]["seed_updates"]
+    scores = curve(RESULTS / COLOURS / "focus_lcp_seed_0.csv")
+    *rounds, last = [f"{score:.2f}" for update, score in scores.items() if update > first]
+    assert max(scores) == updates
+    steps = max(curve(RESULTS / COLOURS / "focus_lcp_seed_0_steps.csv").values())
+    goals, side = len(numbers.goals), math.isqrt(len(numbers.goals))
+    rows = ("focus_lcp", "focus_lcp, image goals")
+    assert all(mean(numbers, row, "final_score") > mean(true, row, "final_score") for row in rows)
+    was = " and ".join(f"{mean(true, row, 'final_score'):.2f}" for row in rows)
+    return [
+        f"{goals} goals, a {side} × {side} grid over the workspace; {numbers.settings['episode_steps']} steps each",
+        f"the scores are [{was}]",
+        f"score is {scores[first]:.2f} after {first:,} updates on scripted and random data, and",
+        f"{', '.join(rounds)} and {last} after the rounds",
+        f"the dataset has {steps:,.0f} steps",
+    ]
+
+
+def test_page_of_the_run_on_colours() -> None:
+    sentences = [*colours(), *STATED_COLOURS]
+    assert missing(COLOURS, sentences) == []
+    assert unchecked(COLOURS, sentences) == []
+
+
 OFFLINE = "cube_move/offline"
 #: What was done: no file beside the page has these numbers.
 STATED_OFFLINE = ["At commit acea4f6 on 2026-11-26", "PyTorch 2.13.0 on the CPU", "took 122 minutes"]
