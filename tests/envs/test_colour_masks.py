@@ -116,6 +116,8 @@ def test_smallest_reaches_the_masks() -> None:
     assert ColourMasks.fit(pixels, masks, smallest=16).segment(pixels).sum() == 16
     with pytest.warns(UserWarning, match="object 0"):
         assert ColourMasks.fit(pixels, masks, smallest=17).segment(pixels).sum() == 0
+    with pytest.warns(UserWarning, match="object 0"):
+        assert ColourMasks.from_clicks(pixels, torch.tensor([[[[4.5, 3.5]]]]), smallest=17).segment(pixels).sum() == 0
 
 
 def test_clicks_are_as_good_as_masks_of_plain_things() -> None:

@@ -249,6 +249,15 @@ def test_transformed_environment_holds_until_the_next_reset():
     assert [p.tolist() for p in second["next", "object_position"].squeeze(1)] == [[0.0, 0.0], position_of(7)]
 
 
+def test_what_was_not_seen_yet_is_at_the_start():
+    """Zero, wherever the start is in the world."""
+    transform = MaskToPosition(SMALL, TOP, plane=FLOOR, axes=(0, 1), start=(0.3, 0.2, 0.0))
+    env = TransformedEnv(Screen([None, None]), transform)
+    assert env.reset()["object_position"][0].tolist() == [0.0, 0.0]
+    masks = torch.zeros(2, 1, 8, 8, dtype=torch.bool)
+    assert not transform(TensorDict({"masks": masks}, [2]))["object_position"].any()
+
+
 def test_one_environment_is_reset_while_another_goes_on():
     screens = [partial(Screen, [2, 3, None, None, None, None], 2), partial(Screen, [4, 5, None, None, None, None])]
     env = TransformedEnv(SerialEnv(2, screens), MaskToPosition(SMALL, TOP, plane=FLOOR, axes=(0, 1)))

@@ -148,6 +148,14 @@ class TestReport:
         assert numbers["agents"]["odd"]["per_goal"] == [{"final_score": [None, 0.5], "goal_error": [None, None]}]
         assert Report.load(tmp_path / "results.json").summary("odd", "final_score") == (0.5, None)
 
+    def test_goals_without_a_score_are_not_in_the_interval(self) -> None:
+        report, whole = (Report(goals=torch.rand(number, 2)) for number in (5, 4))
+        for seed in range(2):
+            scores = torch.rand(4)
+            whole.add("new", {"final_score": scores}, source=str(seed))
+            report.add("new", {"final_score": torch.cat([torch.tensor([math.nan]), scores])}, source=str(seed))
+        assert report.interval("new", "final_score") == whole.interval("new", "final_score")
+
     def test_older_files(self, tmp_path: Path) -> None:
         """Without what a run is known by: their sources stand for it."""
         row = {"sources": ["a", "b"], "per_goal": [{"final_score": [0.5]}, {"final_score": [0.7]}], "metrics": {}}

@@ -6,11 +6,25 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
-from torchrl_ocwm.evidence import Collected, Evaluated, Explored, Machine, Record, Run, Trained, forecast, table
+from torchrl_ocwm.agents import build_agent
+from torchrl_ocwm.evidence import (
+    Collected,
+    Evaluated,
+    Explored,
+    Machine,
+    Record,
+    Run,
+    Trained,
+    estimate,
+    forecast,
+    table,
+)
 from torchrl_ocwm.evidence.estimate import Forecast, Paces
 from torchrl_ocwm.origin import machine
 from torchrl_ocwm.settings import to_dict
+from torchrl_ocwm.testing import reacher_task
 
 TINY = {"image_size": 16, "horizon": 20}
 DATA = Collected(env="reacher", options=TINY, policies={"random": 100})
@@ -72,6 +86,21 @@ def test_a_short_timing(agent: str, tmp_path: Path) -> None:
     for run in (DATA, explored, trained, replace(EVALUATED, trained=trained)):
         assert 1e-5 < paces[run] < 10
         assert paces[run] == paces[run]  # timed once
+
+
+def test_an_explorer_plays_and_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tenth of an update per step."""
+    monkeypatch.setattr(estimate, "seconds_of_a_step", lambda run: 2.0)
+    monkeypatch.setattr(estimate, "seconds_of_an_update", lambda agent, how: 10.0)
+    explored = Explored(env="reacher", options=TINY, explorer="plan2explore", size="debug", steps=100)
+    assert Paces(tmp_path, Machine())[explored] == 3.0
+
+
+def test_updates_are_timed_with_the_threads_of_the_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimate, "_seconds", lambda function, times: torch.get_num_threads())
+    before, agent = torch.get_num_threads(), build_agent("dreamer", reacher_task(16), "debug")
+    assert estimate.seconds_of_an_update(agent, Machine(threads=before + 1)) == before + 1
+    assert torch.get_num_threads() == before
 
 
 def test_episodes_that_are_played_meanwhile_take_their_time(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_cube_move_on_masks_by_colours(command: Callable[..., str], monkeypatch:
     printed = command("evaluate", *evaluate[1:], *SMALL["evaluate"])
     assert "image goals" in printed
     looks = sum(mask.shape == (1, 64, 64) for mask in looked)
-    # The image of the goal, of a scene that was reset; start and steps of the agent with each kind of goal. Random actions
-    # look at nothing.
+    # The image of the goal, of a scene that was reset; start and steps of the agent with each kind of goal. Random
+    # actions look at nothing.
     assert looks == 2 + 2 * (1 + 3)
     assert torch.stack([mask for mask in looked if mask.shape == (1, 64, 64)]).any()

@@ -27,7 +27,7 @@ from torchrl_ocwm.evaluation.videos import OpenLoopFilm
 from torchrl_ocwm.files import FolderInUseError
 from torchrl_ocwm.settings import SettingsError, change
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
-from torchrl_ocwm.training import hooks
+from torchrl_ocwm.training import hooks, provenance
 from torchrl_ocwm.training.loggers import LogError
 from torchrl_ocwm.training.offline import EvaluationError, train_offline
 from torchrl_ocwm.training.settings import Training
@@ -169,6 +169,17 @@ class TestGoingOn:
         with pytest.raises(CheckpointError, match=r"final_lr: 0\.5 there, 0\.1 here"):
             train(fresh(), dataset, tmp_path, training)
         assert Checkpoint.manifest(file)["metadata"]["trained_with"]["training"]["final_lr"] == 0.5
+
+    def test_a_setting_that_came_later_had_its_default(
+        self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        file = train(fresh(), dataset, tmp_path, replace(SHORT, updates=2))
+        there = Checkpoint.manifest(file)["metadata"]["trained_with"]
+        del there["training"]["target_rate"]
+        monkeypatch.setattr(provenance, "_read", lambda file: there)
+        provenance.check_may_go_on(file, SHORT, dataset)
+        with pytest.raises(CheckpointError, match=r"target_rate: 0\.02 there, 0\.5 here"):
+            provenance.check_may_go_on(file, replace(SHORT, target_rate=0.5), dataset)
 
     def test_what_changes_nothing_may_change(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         train(fresh(), dataset, tmp_path, replace(SHORT, updates=2))

@@ -76,7 +76,7 @@ def _other_settings(there: dict[str, Any], training: Training) -> dict[str, str]
 
 def _other_dataset(there: dict[str, Any], dataset: EpisodeDataset, grows: bool) -> dict[str, str]:
     episodes = len(dataset.episode_lengths)
-    if there["episodes"] > episodes or _fingerprint(dataset, there["episodes"]) != there:
+    if _fingerprint(dataset, there["episodes"]) != there:  # also if there are fewer: they have fewer records
         return {"dataset": f"dataset: {there['episodes']} other episodes there than in {dataset.path}"}
     more = episodes - there["episodes"]
     return {"dataset": f"dataset: {dataset.path} has grown by {more} episodes"} if more and not grows else {}
