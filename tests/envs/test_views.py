@@ -94,6 +94,12 @@ def test_two_cameras_need_neither_depth_nor_plane() -> None:
     assert data["object_visible"].tolist() == [True, True]
 
 
+def test_half_precision_does_not_round_positions() -> None:
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        data = two_views()(TensorDict({"left": seen(LEFT), "right": seen(RIGHT)}))
+    assert torch.allclose(data["object_position"], POINTS, atol=A_FIFTH_OF_A_PIXEL)
+
+
 def test_start_and_axes() -> None:
     data = two_views(start=(0.1, 0.2, 0.3), axes=(2, 0))(TensorDict({"left": seen(LEFT), "right": seen(RIGHT)}))
     expected = (POINTS - torch.tensor([0.1, 0.2, 0.3]))[:, [2, 0]]

@@ -97,7 +97,6 @@ class Camera:
         self._set_up(multisampling, shadows)
         self._max_geoms = max_geoms
         self._scene = mujoco.MjvScene(model, maxgeom=max_geoms + 1)  # the last one shows that there are too many
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
         self._known_scene: tuple[int, bytes] | None = None
         self._options = mujoco.MjvOption()
@@ -119,7 +118,7 @@ class Camera:
         before = quality.offsamples, quality.shadowsize, view.offwidth, view.offheight
         quality.offsamples, (view.offheight, view.offwidth) = multisampling, self._fine_size
         if not shadows:
-            quality.shadowsize = 0  # tens of MiB
+            quality.shadowsize = 0  # no shadows, and none of their tens of MiB
         try:
             self._gl = context_class()(view.offwidth, view.offheight)
             self._gl.make_current()
