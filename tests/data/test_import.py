@@ -22,7 +22,7 @@ from torchrl_ocwm.data import (
     export_dataset,
     import_dataset,
 )
-from torchrl_ocwm.data.convert import no_workspace
+from torchrl_ocwm.data.convert import images, no_workspace
 from torchrl_ocwm.envs import ActionRange
 from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.settings import SettingsError, change
@@ -440,3 +440,11 @@ def test_settings_that_do_not_fit_together() -> None:
         Importing(low=(1.0,))
     with pytest.raises(SettingsError, match="keys.pixels must be"):
         change(Importing(), {"keys.pixels": 3})
+
+
+def test_smaller_images_are_means_not_samples() -> None:
+    """Black where a sample would be taken, white around it."""
+    row = np.array([255, 0, 0, 255] * 4, np.uint8)
+    small = images(np.broadcast_to(row, (1, 16, 16)).copy(), (4, 4))
+    assert small.min() > 50
+    assert small.max() < 200

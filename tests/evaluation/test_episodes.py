@@ -301,6 +301,17 @@ def test_reconstruction_error_by_hand(make_agent: Any) -> None:
     assert "goal_error" not in ReconstructionError(make_agent("dreamer_pcp"))(step)
 
 
+def test_reconstruction_error_of_the_object_in_question() -> None:
+    agent = build_agent("dreamer", replace(reacher_task(), objects=("finger", "thumb")), "debug")
+    agent.model.vector_decoders["object_position"] = Constant([0.5, 0.0, 0.0, 0.25])  # units of 0.24 m
+    latent = TensorDict({"state": torch.zeros(1, agent.model.state), "belief": torch.zeros(1, agent.model.belief)}, [1])
+    true, goal = torch.tensor([[[0.12, 0.0], [0.0, 0.11]]]), torch.zeros(1, 2)
+    step = TensorDict({"latent": latent, "object_position_true": true, "goal_position": goal}, [1])
+    for index, error in enumerate((0.0, 0.05)):
+        found = ReconstructionError(agent, object_index=index)(step)["entity_error"]
+        torch.testing.assert_close(found, torch.tensor([error]), atol=1e-6, rtol=0)
+
+
 class Constant(torch.nn.Module):
     def __init__(self, value: list[float]) -> None:
         super().__init__()

@@ -197,6 +197,14 @@ def test_what_is_predicted_is_learnt_and_not_seen(row: str) -> None:
     assert "object_position" in make(row).policy().in_keys
 
 
+@pytest.mark.parametrize("row", ["dreamer", "focus"])
+def test_goals_can_be_predicted_alone(row: str) -> None:
+    changes = {"world_model.observed": ("proprio", "object_position"), "world_model.predicted": ("goal_position",)}
+    agent = make(row, changes)
+    assert agent.loss.model_loss(random_records(TASK, 2, 3))[0]["loss_model_goal_position"] > 0
+    assert "goal_position" not in agent.policy().in_keys
+
+
 def test_nothing_is_observed_and_predicted() -> None:
     with pytest.raises(SettingsError, match="'object_position' is in observed and in predicted"):
         make("focus", {"world_model.predicted": ("object_position",)})

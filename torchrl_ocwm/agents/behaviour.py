@@ -112,7 +112,7 @@ def make_actor(scene: Scene, goal_features: int) -> ProbabilisticTensorDictSeque
             ["loc", "scale"],
             {
                 "distribution_class": IndependentNormal,
-                "distribution_kwargs": {"tanh_loc": False, "validate_args": False},
+                "distribution_kwargs": {"validate_args": False},
             },
         )
     )
