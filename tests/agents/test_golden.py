@@ -1,6 +1,6 @@
 """The rows compute what they computed in release 0.1, but for goal latents, which have had one length since.
 
-Losses of three updates in float64, as commit caf7a5f gives them. In float32 its losses were those of 0.1, bit for bit.
+Losses of three updates in float64, as commit caf7a5f gives them, which wrote down those of 0.1 in float32.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,6 +38,12 @@ def mean(report: Report, agent: str, metric: str, scale: float = 1) -> float:
 
 def cell(report: Report, agent: str, metric: str) -> str:
     return _cell(report.summary(agent, metric), COLUMNS[metric][1])
+
+
+def grid(report: Report) -> str:
+    """What a page says of an evaluation's goals."""
+    goals, side = len(report.goals), math.isqrt(len(report.goals))
+    return f"{goals} goals, a {side} × {side} grid over the workspace; {report.settings['episode_steps']} steps each"
 
 
 def diagnosis(name: str) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -10,7 +10,7 @@ from reading import RESULTS, ROOT, cell, report
 REACHER = ["reacher", "reacher/ablations", "reacher/visual_goals", "reacher/planner"]
 
 
-@pytest.mark.parametrize("name", [*REACHER, "cube_move", "cube_move/online", "cube_move/offline"])
+@pytest.mark.parametrize("name", [*REACHER, "cube_move", "cube_move/online", "cube_move/offline", "cube_move/colours"])
 def test_tables_are_those_of_the_numbers(name: str) -> None:
     table = report(name).markdown()
     assert (RESULTS / name / "results.md").read_text() == table + "\n"
