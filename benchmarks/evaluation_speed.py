@@ -1,15 +1,16 @@
 """Where the time of an evaluation goes, and how long it takes beside another commit.
 
     MUJOCO_GL=egl python benchmarks/evaluation_speed.py CHECKPOINT [--goals 100] [--steps 150] [--rounds 3]
-        [--workers 2] [--image-goals] [--before COMMIT]
+        [--workers 2] [--image-goals] [--before COMMIT [--before-checkpoint FILE]]
 
 Runs ``ocwm evaluate`` with the library's functions timed: seconds that pass in each part, those of the parts
 within it not counted. ``--workers 0`` steps the environments in the process that evaluates, which shows what their
 steps consist of. All numbers are medians over rounds; "processor" is the time of all processes together, which says
 more than the others on a machine that does something else too.
 
-``--before`` runs another commit too (one that has ``torchrl_ocwm/recipes/evaluate.py``), in a worktree of git and in
-turns with this one, and says whether its scores are the same, goal by goal.
+``--before`` runs another commit too, in a worktree of git and in turns with this one, and says whether its scores are
+the same, goal by goal. What that commit does elsewhere counts to "everything else" there. ``--before-checkpoint`` is
+for a commit that cannot read the checkpoints of this one. Parts are those of the main thread.
 """
 
 from __future__ import annotations
@@ -19,14 +20,16 @@ import importlib
 import json
 import os
 import resource
+import runpy
 import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -69,7 +72,7 @@ class Clock:
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
         """Count what passes inside."""
-        if self._whole:
+        if self._whole or threading.current_thread() is not threading.main_thread():
             yield
             return
         self._whole = name in WHOLE
@@ -94,35 +97,46 @@ class Clock:
         setattr(owner, function, timed)
 
 
-def evaluate(*arguments: str) -> None:
-    """Evaluate with the library that is on the path, and print the seconds of each part as JSON."""
+def evaluate(folder: str, *arguments: str) -> None:
+    """Evaluate as the script of a checkout does, and print the seconds of each part as JSON."""
     clock = Clock()
     with clock.part(ELSE):
         for name, functions in PARTS.items():
             for place in functions:
-                room, _, path = place.partition(":")
-                owner: Any = importlib.import_module(f"torchrl_ocwm.{room}")
-                *classes, function = path.split(".")
-                for one in classes:
-                    owner = getattr(owner, one)
-                clock.watch(owner, function, name)
-        sys.argv = ["ocwm", *arguments]
-        importlib.import_module("torchrl_ocwm.recipes.evaluate").main()
+                # An older commit may lack one: its time is "everything else" there.
+                with suppress(*(() if Path(folder) == ROOT else (ImportError, AttributeError))):
+                    owner, function = find(place)
+                    clock.watch(owner, function, name)
+        script = Path(folder, "examples", "evaluate.py")
+        sys.argv = [str(script), *arguments]
+        runpy.run_path(str(script), run_name="__main__")
     print("\n" + json.dumps(clock.seconds))
 
 
-def measure(folder: Path, arguments: argparse.Namespace) -> tuple[dict[str, float], Any]:
+def find(place: str) -> tuple[Any, str]:
+    """Where a function of :data:`PARTS` is, and its name there."""
+    room, _, path = place.partition(":")
+    owner: Any = importlib.import_module(f"torchrl_ocwm.{room}")
+    *classes, function = path.split(".")
+    for one in classes:
+        owner = getattr(owner, one)
+    getattr(owner, function)
+    return owner, function
+
+
+def measure(folder: Path, checkpoint: Path, arguments: argparse.Namespace) -> tuple[dict[str, float], Any]:
     """Seconds of each part of an evaluation, and what it found for each goal."""
     with tempfile.TemporaryDirectory() as output:
         given = {
-            "checkpoint": arguments.checkpoint,
+            "checkpoint": checkpoint,
             "goals": arguments.goals,
             "episode_steps": arguments.steps,
             "workers": arguments.workers,
             "image_goals": arguments.image_goals,
             "output": output,
         }
-        command = [sys.executable, __file__, "--child", *(f"{key}={value}" for key, value in given.items())]
+        settings = [f"{key}={value}" for key, value in given.items()]
+        command = [sys.executable, __file__, "--child", str(folder), *settings]
         environment = {**os.environ, "PYTHONPATH": str(folder)}
         before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -158,20 +172,23 @@ def table(turns: Sequence[Sequence[dict[str, float]]], workers: int) -> Iterator
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkpoint", help="of an agent")
+    parser.add_argument("checkpoint", type=Path, help="of an agent")
     parser.add_argument("--goals", type=int, default=100)
     parser.add_argument("--steps", type=int, default=150, help="of an episode")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--workers", type=int, default=2, help="processes that step environments")
     parser.add_argument("--image-goals", action="store_true", help="give the goals as images too")
     parser.add_argument("--before", metavar="COMMIT", help="a commit to compare with")
+    parser.add_argument("--before-checkpoint", type=Path, metavar="FILE", help="of an agent, for that commit")
     arguments = parser.parse_args()
-    arguments.checkpoint = Path(arguments.checkpoint).resolve()
     with ExitStack() as stack:
-        folders = [ROOT]
+        turn = [(ROOT, arguments.checkpoint)]
         if arguments.before:
-            folders.append(stack.enter_context(checkout(arguments.before)))
-        rounds = [[measure(folder, arguments) for folder in folders] for _ in range(arguments.rounds)]
+            old = arguments.before_checkpoint or arguments.checkpoint
+            turn.append((stack.enter_context(checkout(arguments.before)), old))
+        rounds = [
+            [measure(folder, file.resolve(), arguments) for folder, file in turn] for _ in range(arguments.rounds)
+        ]
     about = f"{arguments.goals} goals, {arguments.steps} steps, {arguments.workers} processes"
     print(f"{about}; medians of {len(rounds)} rounds")
     print("\n".join(table([[seconds for seconds, _ in turn] for turn in rounds], arguments.workers)))

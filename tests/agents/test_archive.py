@@ -262,3 +262,12 @@ for megabytes in (0, 0.25, 0.5, 1, 2, 4):
 def test_reads_what_earlier_releases_wrote(tmp_path: Path) -> None:
     Checkpoint(format="archive", layer=layer(4.0)).save(tmp_path / "checkpoint.zip")
     assert kept(tmp_path / "checkpoint.zip") == 4.0
+
+
+def test_weights_that_do_not_fit_are_said_in_a_few_words(tmp_path: Path) -> None:
+    """PyTorch names each of them, which can be hundreds."""
+    layers = {str(number): torch.nn.Linear(1, 1) for number in range(100)}
+    file = Archive(layers=torch.nn.ModuleDict(layers)).save(tmp_path / "layers.zip")
+    with pytest.raises(CheckpointError, match=r"layers\.zip: cannot be loaded \(.*Unexpected key.* …\)$") as caught:
+        Archive(layers=torch.nn.ModuleDict()).load(file)
+    assert len(str(caught.value)) < 500

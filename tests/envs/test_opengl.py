@@ -6,8 +6,8 @@ import sys
 import mujoco
 import pytest
 
-from torchrl_ocwm.envs import camera as camera_module
 from torchrl_ocwm.envs import opengl
+from torchrl_ocwm.envs import shared_context as context_module
 from torchrl_ocwm.envs.camera import Camera
 
 MODEL = mujoco.MjModel.from_xml_string('<mujoco><worldbody><camera name="top"/></worldbody></mujoco>')
@@ -25,7 +25,7 @@ def assert_says_what_to_install(message: str) -> None:
 
 
 def test_context_that_cannot_be_made(monkeypatch):
-    monkeypatch.setattr(camera_module, "context_class", lambda: BrokenContext)
+    monkeypatch.setattr(context_module, "context_class", lambda: BrokenContext)
     before = MODEL.vis.global_.offwidth
     with pytest.raises(RuntimeError, match=r"ImportError: libEGL\.so\.1: cannot open shared object file") as caught:
         Camera(MODEL, "top")

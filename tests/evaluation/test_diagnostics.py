@@ -22,6 +22,7 @@ from torchrl_ocwm.evaluation.objects import (
     mask_overlap,
     object_errors,
     position_error,
+    predict_objects,
     quartiles,
     unmoved_error,
 )
@@ -162,6 +163,22 @@ def test_errors_start_after_the_context(make_agent: Any) -> None:
     assert not torch.equal(changed["filtered"]["median"], errors["filtered"]["median"])
 
 
+@pytest.mark.usefixtures("no_noise")
+def test_what_is_decoded_already_is_not_decoded_again(make_agent: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, records = make_agent("focus_pcp").model, random_records(reacher_task(), 3, 8)
+    alone, views = object_errors(model, records, 3), predict_objects(model, records, 3)
+    monkeypatch.setattr(model.object_decoder, "forward", None)
+    together = object_errors(model, records, 3, views=views)
+    for name, curves in alone.items():
+        torch.testing.assert_close(together[name], curves, equal_nan=True)
+    views["imagined"]["state"] = torch.zeros_like(views["imagined"]["state"])
+    views["imagined"]["masks"] = views["imagined"]["masks"].flip(-3)  # object and background change places
+    changed = object_errors(model, records, 3, views=views)
+    for key in ("median", "mask_overlap"):
+        assert not torch.equal(changed["imagined"][key], alone["imagined"][key])
+        torch.testing.assert_close(changed["filtered"][key], alone["filtered"][key], equal_nan=True)
+
+
 def test_errors_are_of_what_a_model_has(make_agent: Any) -> None:
     records = random_records(reacher_task(), 2, 5)
     flat = object_errors(make_agent("dreamer_pcp").model, records, 2)
@@ -245,7 +262,7 @@ class TestPictures:
     @pytest.mark.usefixtures("no_noise")
     def test_rows(self, make_agent: Any) -> None:
         model, records = make_agent("focus_pcp").model, random_records(reacher_task(), 2, 5)
-        rows = object_rows(model, records, 3, ["finger"])
+        rows = object_rows(records, predict_objects(model, records, 3), ["finger"])
         pixels, masks = records["next", "pixels"], records["next", "masks"]
         assert torch.equal(rows["scene: true"], pixels)
         assert torch.equal(rows["finger mask: true"][:, :, 0], 255 * masks[:, :, 0].byte())
@@ -308,7 +325,7 @@ class TestPictures:
         flat, objects = frames
         assert flat.shape[-2] == 3 * 66
         assert objects.shape[-2] == 4 * 66
-        rows = object_rows(agent.model, film.records, 2, ["finger"])
+        rows = object_rows(film.records, predict_objects(agent.model, film.records, 2), ["finger"])
         for place, row in ((1, "scene: imagined"), (2, "finger mask: imagined")):
             shown = objects[:, :, 66 * place : 66 * place + 64, :64].int()
             assert (shown - rows[row][0].int()).abs().max() <= 1

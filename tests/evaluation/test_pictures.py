@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import subprocess
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,19 @@ import torch
 from torchrl.record.loggers import CSVLogger
 
 from torchrl_ocwm.envs import Workspace
-from torchrl_ocwm.evaluation import Report, plots
+from torchrl_ocwm.evaluation import Report, plots, videos
 from torchrl_ocwm.evaluation.imagined import imagined_rollout
 from torchrl_ocwm.evaluation.output import OutputError
 from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, metric_lines, read_scalar
-from torchrl_ocwm.evaluation.videos import OpenLoopFilm, decode_video, mark, open_loop_prediction, tile, write_video
+from torchrl_ocwm.evaluation.videos import (
+    OpenLoopFilm,
+    decode_video,
+    mark,
+    open_loop_prediction,
+    tile,
+    videos_beside,
+    write_video,
+)
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
 
 
@@ -130,6 +139,40 @@ def test_video_is_readable(tmp_path: Path) -> None:
     assert video.shape == (7, 42, 66, 3)
     assert video[1].mean() < 20
     assert video[5][..., 0].mean() > 200
+
+
+def test_videos_are_written_while_the_next_is_computed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    computed, begun = threading.Event(), []
+
+    def wait_for_the_next(file: Path, frames: torch.Tensor, **options: Any) -> None:
+        begun.append((file.name, len(frames), options, threading.current_thread() is threading.main_thread()))
+        assert computed.wait(10)
+        write_video(file, frames, **options)
+
+    monkeypatch.setattr(videos, "write_video", wait_for_the_next)
+    with videos_beside() as write:
+        for name, length in (("one.mp4", 2), ("two.mp4", 3)):
+            write(tmp_path / name, torch.zeros(length, 3, 16, 16, dtype=torch.uint8), scale=2)
+        computed.set()
+    assert begun == [("one.mp4", 2, {"scale": 2}, False), ("two.mp4", 3, {"scale": 2}, False)]
+    for name, length in (("one.mp4", 2), ("two.mp4", 3)):
+        assert imageio.imread(tmp_path / name, plugin="FFMPEG", index=None).shape == (length, 32, 32, 3)
+
+
+def test_a_video_beside_that_cannot_be_written_raises_in_the_end(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    begun = []
+
+    def write_both() -> None:
+        with videos_beside() as write:
+            for file in (tmp_path / "file" / "one.mp4", tmp_path / "two.mp4"):
+                write(file, torch.zeros(2, 3, 16, 16, dtype=torch.uint8))
+                begun.append(file.name)
+
+    with pytest.raises(OutputError, match="file"):
+        write_both()
+    assert begun == ["one.mp4", "two.mp4"]
+    assert (tmp_path / "two.mp4").exists()
 
 
 def test_tile_puts_examples_side_by_side() -> None:

@@ -15,8 +15,7 @@ from rows import shows
 from torchrl_ocwm.agents import build_agent, save_agent
 from torchrl_ocwm.devices import DeviceError
 from torchrl_ocwm.envs import Task, make_task
-from torchrl_ocwm.evaluation import EvaluationEnvs, episodes
-from torchrl_ocwm.recipes import pictures
+from torchrl_ocwm.evaluation import EvaluationEnvs, episodes, videos
 from torchrl_ocwm.testing import random_dataset
 
 
@@ -69,7 +68,7 @@ def evaluate(
             patch.setattr(episodes, "make_worker", note_worker)
             for name in ("draw", "picture_episodes"):
                 patch.setattr(module, name, lambda *_, **__: ())
-            patch.setattr(pictures, "write_video", lambda file, frames: seen["films"].append((Path(file).name, frames)))
+            patch.setattr(videos, "write_video", lambda file, frames: seen["films"].append((Path(file).name, frames)))
             small = {"goals": 1, "episode_steps": 1, "workers": 0, "video_goals": 0, "random": "false"}
             named = {argument.partition("=")[0] for argument in arguments}
             rest = [f"{name}={value}" for name, value in small.items() if name not in named]
@@ -178,7 +177,7 @@ def diagnose(
             patch.setattr(module, "latent_pairs", note_pairs)
             for name in ("draw_errors", "draw_goal_latents"):
                 patch.setattr(module, name, lambda *_: None)
-            patch.setattr(module, "picture_objects", lambda *given: seen["pictured"].append(len(given[2])))
+            patch.setattr(module, "picture_objects", lambda *given: seen["pictured"].append(len(given[1])))
             small = {"sequences": 3, "length": 6, "context": 2, "frames": 5, "dataset": files["data"], "output": "out"}
             named = {argument.partition("=")[0] for argument in arguments}
             rest = [f"{name}={value}" for name, value in small.items() if name not in named]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import textwrap
 import zipfile
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -11,6 +12,8 @@ from typing import Any, Protocol, runtime_checkable
 from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 
 from torchrl_ocwm.files import replacing, sync
+
+_REASON = 300  # characters of what PyTorch says at most
 
 
 @runtime_checkable
@@ -76,7 +79,8 @@ class Archive(Checkpoint):
         try:
             return super().load(path, **options)
         except (CheckpointError, OSError) as error:
-            raise CheckpointError(f"{path}: cannot be loaded ({error})") from error
+            reason = textwrap.shorten(str(error), _REASON, placeholder=" …")  # PyTorch names each weight
+            raise CheckpointError(f"{path}: cannot be loaded ({reason})") from error
 
 
 def read_manifest(path: str | Path) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from torchrl_ocwm.envs.opengl import OPEN, close_at_exit, context_class, import_mujoco, renderer_error
+from torchrl_ocwm.envs.opengl import OPEN, close_at_exit, import_mujoco
+from torchrl_ocwm.envs.shared_context import SharedContext, shared_context
 
 if TYPE_CHECKING:
     import mujoco
@@ -92,9 +93,12 @@ class Camera:
             raise ValueError(f"max_geoms must be from 1 to {_MAX_GEOMS - 1}, got {max_geoms}")
         self.model, self.height, self.width, self.mask_scale = model, height, width, mask_scale
         self._thread = threading.current_thread()
-        self._context: Any = None
-        self._gl: Any = None
-        self._set_up(multisampling, shadows)
+        fine = self._fine_size
+        self._context: SharedContext | None = None  # if there is none, what follows raises
+        self._context = shared_context(
+            model, height=fine[0], width=fine[1], multisampling=multisampling, shadows=shadows
+        )
+        close_at_exit(self)
         self._max_geoms = max_geoms
         self._scene = mujoco.MjvScene(model, maxgeom=max_geoms + 1)  # the last one shows that there are too many
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
@@ -102,7 +106,6 @@ class Camera:
         self._options = mujoco.MjvOption()
         self._view = mujoco.MjvCamera()
         self._view.type, self._view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, self.camera_id
-        fine = self._fine_size
         self._rectangle, self._fine = mujoco.MjrRect(0, 0, width, height), mujoco.MjrRect(0, 0, *fine[::-1])
         self._pixels = np.empty((height, width, 3), np.uint8)
         self._ids = np.empty((*fine, 3), np.uint8)
@@ -112,25 +115,6 @@ class Camera:
     def _fine_size(self) -> tuple[int, int]:
         return self.mask_scale * self.height, self.mask_scale * self.width
 
-    def _set_up(self, multisampling: int, shadows: bool) -> None:
-        """Make the OpenGL context; its buffers take their sizes and samples from the model, which stays unchanged."""
-        quality, view = self.model.vis.quality, self.model.vis.global_
-        before = quality.offsamples, quality.shadowsize, view.offwidth, view.offheight
-        quality.offsamples, (view.offheight, view.offwidth) = multisampling, self._fine_size
-        if not shadows:
-            quality.shadowsize = 0  # no shadows, and none of their tens of MiB
-        try:
-            self._gl = context_class()(view.offwidth, view.offheight)
-            self._gl.make_current()
-            self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        except Exception as error:  # each OpenGL binding raises an error class of its own
-            raise renderer_error(error) from error
-        finally:
-            quality.offsamples, quality.shadowsize, view.offwidth, view.offheight = before
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
-        close_at_exit(self)
-
     def render(self, data: mujoco.MjData, *, depth: bool = False) -> Frame:
         """Render the state in ``data``, which must be up to date (``mj_forward``).
 
@@ -139,10 +123,12 @@ class Camera:
             depth: Read the depth too; it comes out of the segmentation pass.
         """
         pixels = self.picture(data)
+        assert self._context is not None
+        context = self._context.mujoco
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
-        mujoco.mjr_render(self._fine, self._scene, self._context)
-        mujoco.mjr_readPixels(self._ids, self._depth if depth else None, self._fine, self._context)
+        mujoco.mjr_render(self._fine, self._scene, context)
+        mujoco.mjr_readPixels(self._ids, self._depth if depth else None, self._fine, context)
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
         return Frame(pixels, self._geoms(), self._metres() if depth else None)
 
@@ -153,25 +139,27 @@ class Camera:
             data: A state of the camera's model.
             fine: As large as the segmentation, ``[S * H, S * W, 3]``.
         """
-        if self._context is None:
-            raise RuntimeError("this camera is closed")
-        self._make_current()
+        context = self._current()
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self.model, data, self._options, None, self._view, everything, self._scene)
         if self._scene.ngeom > self._max_geoms:
             raise ValueError(f"the scene has more than {self._max_geoms} geoms; give the camera a larger max_geoms")
         size, buffer = (self._fine, self._ids) if fine else (self._rectangle, self._pixels)
-        mujoco.mjr_render(size, self._scene, self._context)
-        mujoco.mjr_readPixels(buffer, None, size, self._context)
+        mujoco.mjr_render(size, self._scene, context)
+        mujoco.mjr_readPixels(buffer, None, size, context)
         return buffer[::-1].copy()  # OpenGL's rows run upwards
 
-    def _make_current(self) -> None:
+    def _current(self) -> Any:
+        """MuJoCo's context, ready to be used."""
+        if self._context is None:
+            raise RuntimeError("this camera is closed")
         if threading.current_thread() is not self._thread:
             raise RuntimeError(
                 f"this camera belongs to the thread {self._thread.name!r}, as OpenGL wants it; make, step and close an "
                 "environment in one thread"
             )
-        self._gl.make_current()
+        self._context.make_current()
+        return self._context.mujoco
 
     def _geoms(self) -> np.ndarray:
         # Which geoms are in the scene depends on what is transparent; reading the list is slow.
@@ -213,13 +201,11 @@ class Camera:
         return pose
 
     def close(self) -> None:
-        """Free the OpenGL context. Closing twice does nothing."""
+        """Leave the OpenGL context, which the last camera frees. Closing twice does nothing."""
         if self._context is not None:
-            self._make_current()  # it would free the buffers of whichever camera rendered last
-            self._context.free()
-        if self._gl is not None:
-            self._gl.free()
-        self._context = self._gl = None
+            self._current()
+            self._context.release()
+        self._context = None
         OPEN.discard(self)
 
     def __del__(self) -> None:

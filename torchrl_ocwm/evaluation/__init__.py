@@ -19,7 +19,7 @@ from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
 from torchrl_ocwm.evaluation.html import write_html
 from torchrl_ocwm.evaluation.imagined import imagined_distance, imagined_rollout, predicted_return
 from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation, can_play
-from torchrl_ocwm.evaluation.objects import object_errors
+from torchrl_ocwm.evaluation.objects import object_errors, predict_objects
 from torchrl_ocwm.evaluation.open_loop import posterior, random_sequences
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.reconstruction import ReconstructionError
@@ -31,7 +31,16 @@ from torchrl_ocwm.lazy import lazily
 if TYPE_CHECKING:
     from torchrl_ocwm.evaluation.object_pictures import draw_errors, draw_goal_latents, picture_objects
     from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, metric_lines, save_figure
-    from torchrl_ocwm.evaluation.videos import OpenLoopFilm, check_ffmpeg, decode_video, mark, tile, write_video
+    from torchrl_ocwm.evaluation.videos import (
+        OpenLoopFilm,
+        WriteVideo,
+        check_ffmpeg,
+        decode_video,
+        mark,
+        tile,
+        videos_beside,
+        write_video,
+    )
 
 __all__ = [
     "Diagnosis",
@@ -42,6 +51,7 @@ __all__ = [
     "OpenLoopFilm",
     "ReconstructionError",
     "Report",
+    "WriteVideo",
     "can_play",
     "check_ffmpeg",
     "decode_video",
@@ -63,12 +73,14 @@ __all__ = [
     "object_errors",
     "picture_objects",
     "posterior",
+    "predict_objects",
     "predicted_return",
     "random_sequences",
     "save_figure",
     "tile",
     "to_json",
     "transition",
+    "videos_beside",
     "write_html",
     "write_video",
     "writing",
@@ -79,6 +91,7 @@ __getattr__ = lazily(
     __name__,
     {
         "OpenLoopFilm": "videos",
+        "WriteVideo": "videos",
         "check_ffmpeg": "videos",
         "decode_video": "videos",
         "draw_errors": "object_pictures",
@@ -90,6 +103,7 @@ __getattr__ = lazily(
         "picture_objects": "object_pictures",
         "save_figure": "plots",
         "tile": "videos",
+        "videos_beside": "videos",
         "write_video": "videos",
     },
 )

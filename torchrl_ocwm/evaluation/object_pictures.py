@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -11,11 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_ocwm.evaluation.goal_latents import cosines, distances
-from torchrl_ocwm.evaluation.objects import decode_objects
-from torchrl_ocwm.evaluation.open_loop import open_loop_latents, posterior
 from torchrl_ocwm.evaluation.plots import save_figure
-from torchrl_ocwm.evaluation.videos import grey, tile, to_uint8, write_video
-from torchrl_ocwm.modules import ObjectWorldModel
+from torchrl_ocwm.evaluation.videos import WriteVideo, grey, tile, to_uint8, write_video
 from torchrl_ocwm.modules.dtypes import unit_image
 from torchrl_ocwm.objectives.focus import instance_masks
 
@@ -23,14 +20,13 @@ _STYLES = {"filtered": "C0", "imagined": "C3", "unmoved": "0.5"}
 
 
 def object_rows(
-    model: ObjectWorldModel, records: TensorDictBase, context: int, names: Sequence[str]
+    records: TensorDictBase, views: Mapping[str, TensorDictBase], names: Sequence[str]
 ) -> dict[str, Tensor]:
     """The scene, and mask and masked colours of each object: true, predicted from all frames, and imagined.
 
     Args:
-        model: The world model.
         records: ``[N, T]`` records, the first of each sequence with ``is_init`` set.
-        context: Frames that are seen before the rest is imagined.
+        views: What :func:`~torchrl_ocwm.evaluation.objects.predict_objects` gives for them.
         names: Names of the O objects.
 
     Returns:
@@ -38,39 +34,41 @@ def object_rows(
 
     Examples:
         >>> from torchrl_ocwm.agents import build_agent
+        >>> from torchrl_ocwm.evaluation import predict_objects
         >>> from torchrl_ocwm.testing import random_records, reacher_task
         >>> model = build_agent("focus_pcp", reacher_task(), size="debug").model
-        >>> list(object_rows(model, random_records(reacher_task(), 2, 6), 3, ["finger"]))[3:6]
+        >>> records = random_records(reacher_task(), 2, 6)
+        >>> list(object_rows(records, predict_objects(model, records, 3), ["finger"]))[3:6]
         ['finger mask: true', 'finger mask: filtered', 'finger mask: imagined']
     """
-    views = {
+    parts = {
         "true": (
             unit_image(records["next", "pixels"]).unsqueeze(-4),
             instance_masks(records["next", "masks"]).float(),
         ),
-        "filtered": decode_objects(model, posterior(model, records, "state", "belief")),
-        "imagined": decode_objects(model, open_loop_latents(model, records, context)),
+        **{view: (latents["colours"], latents["masks"]) for view, latents in views.items()},
     }
-    masked = {view: masks.unsqueeze(-3) * colours for view, (colours, masks) in views.items()}
-    rows = {f"scene: {view}": to_uint8(parts.sum(-4)) for view, parts in masked.items()}
+    masked = {view: masks.unsqueeze(-3) * colours for view, (colours, masks) in parts.items()}
+    rows = {f"scene: {view}": to_uint8(each.sum(-4)) for view, each in masked.items()}
     for index, name in enumerate(names):
-        rows |= {f"{name} mask: {view}": grey(masks[:, :, index]) for view, (_, masks) in views.items()}
-        rows |= {f"{name}: {view}": to_uint8(parts[:, :, index]) for view, parts in masked.items()}
+        rows |= {f"{name} mask: {view}": grey(masks[:, :, index]) for view, (_, masks) in parts.items()}
+        rows |= {f"{name}: {view}": to_uint8(each[:, :, index]) for view, each in masked.items()}
     return {label: row.cpu() for label, row in rows.items()}
 
 
 def picture_objects(
-    folder: str | Path, model: ObjectWorldModel, records: TensorDictBase, context: int, names: Sequence[str]
+    folder: str | Path,
+    records: TensorDictBase,
+    views: Mapping[str, TensorDictBase],
+    context: int,
+    names: Sequence[str],
+    *,
+    write: WriteVideo = write_video,
 ) -> None:
-    """Write ``objects.mp4`` and ``objects.png``; takes what :func:`object_rows` takes."""
-    rows = object_rows(model, records, context, names)
-    film_objects(Path(folder) / "objects.mp4", rows)
+    """Write ``objects.mp4`` and ``objects.png``; takes what :func:`object_rows` and :func:`draw_objects` take."""
+    rows = object_rows(records, views, names)
+    write(Path(folder) / "objects.mp4", tile(list(rows.values())), scale=2)  # one sequence per column
     draw_objects(Path(folder) / "objects.png", rows, context)
-
-
-def film_objects(path: str | Path, rows: dict[str, Tensor]) -> None:
-    """Write a video of :func:`object_rows`, one sequence per column."""
-    write_video(path, tile(list(rows.values())), scale=2)
 
 
 def draw_objects(path: str | Path, rows: dict[str, Tensor], context: int, *, frames: int = 6) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -11,13 +13,45 @@ from torchrl_ocwm.modules import ObjectWorldModel, RSSMWorldModel
 from torchrl_ocwm.objectives.focus import instance_masks
 
 
-def object_errors(model: RSSMWorldModel, records: TensorDictBase, context: int) -> dict[str, dict[str, Tensor]]:
+def predict_latents(model: RSSMWorldModel, records: TensorDictBase, context: int) -> dict[str, TensorDictBase]:
+    """Latents of what a world model sees and imagines.
+
+    Args:
+        model: The world model.
+        records: ``[N, T]`` records, the first of each sequence with ``is_init`` set.
+        context: Frames that are seen.
+
+    Returns:
+        ``filtered``: all frames are seen; ``imagined``: those of the context only. Each ``[N, T]`` with ``state`` and
+        ``belief``.
+    """
+    return {
+        "filtered": posterior(model, records, "state", "belief"),
+        "imagined": open_loop_latents(model, records, context),
+    }
+
+
+def predict_objects(model: ObjectWorldModel, records: TensorDictBase, context: int) -> dict[str, TensorDictBase]:
+    """:func:`predict_latents` with the ``colours`` and ``masks`` of :func:`decode_objects`.
+
+    These take 64 KiB for each object in an image of 64 x 64.
+    """
+    views = predict_latents(model, records, context)
+    for latents in views.values():
+        latents["colours"], latents["masks"] = decode_objects(model, latents)
+    return views
+
+
+def object_errors(
+    model: RSSMWorldModel, records: TensorDictBase, context: int, *, views: Mapping[str, TensorDictBase] | None = None
+) -> dict[str, dict[str, Tensor]]:
     """How far off masks and positions are in the frames after the context, step by step.
 
     Args:
         model: The world model.
         records: ``[N, T]`` records, the first of each sequence with ``is_init`` set.
         context: Frames that are seen.
+        views: What :func:`predict_latents` or :func:`predict_objects` gives for these, if it is there already.
 
     Returns:
         ``filtered``: all frames are seen; ``imagined``: those of the context only; ``unmoved``: the guess that objects
@@ -33,11 +67,8 @@ def object_errors(model: RSSMWorldModel, records: TensorDictBase, context: int) 
         >>> errors["imagined"]["median"].shape
         torch.Size([1, 6])
     """
-    views = {
-        "filtered": posterior(model, records, "state", "belief")[:, context:],
-        "imagined": open_loop_latents(model, records, context)[:, context:],
-    }
-    future = records[:, context:]
+    views = predict_latents(model, records, context) if views is None else views
+    views, future = {name: latents[:, context:] for name, latents in views.items()}, records[:, context:]
     errors: dict[str, dict[str, Tensor]] = {name: {} for name in (*views, "unmoved")}
     if "object_position" in model.decoded:
         errors = {name: quartiles(position_error(model, latents, future)) for name, latents in views.items()}
@@ -81,14 +112,17 @@ def mask_overlap(model: ObjectWorldModel, latents: TensorDictBase, masks: Tensor
 
     Args:
         model: The world model.
-        latents: ``[N, T]`` with ``state`` and ``belief``.
+        latents: ``[N, T]`` with ``state`` and ``belief``, and ``masks`` if they are decoded already.
         masks: True masks ``[N, T, O, H, W]`` bool. Where objects overlap, the first of them has the pixel.
 
     Returns:
         ``[N, T, O]``, NaN where an object is neither there nor predicted.
     """
     steps = zip(latents.unbind(1), masks.unbind(1), strict=True)
-    return torch.stack([_overlap(decode_objects(model, step)[1], true) for step, true in steps], 1)
+    decoded = "masks" in latents.keys()
+    return torch.stack(
+        [_overlap(step["masks"] if decoded else decode_objects(model, step)[1], true) for step, true in steps], 1
+    )
 
 
 def _overlap(probabilities: Tensor, masks: Tensor) -> Tensor:

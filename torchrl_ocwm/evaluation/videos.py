@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,9 @@ from torchrl_ocwm.evaluation.objects import decode_objects
 from torchrl_ocwm.evaluation.open_loop import open_loop_latents
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.modules import ObjectWorldModel, RSSMWorldModel
+
+#: :func:`write_video`, or one that does not wait for it.
+WriteVideo = Callable[..., object]
 
 
 def check_ffmpeg(setting: str) -> None:
@@ -65,6 +70,22 @@ def write_video(path: str | Path, frames: Tensor, *, fps: int = 15, scale: int =
         written = _frames(file)
         if written != len(images):
             raise OSError(f"ffmpeg wrote {written} of {len(images)} frames; is the disk full, or the folder not yours?")
+
+
+@contextmanager
+def videos_beside() -> Iterator[WriteVideo]:
+    """A :func:`write_video` that returns at once, so that FFmpeg works while the next video is computed.
+
+    At the end of the ``with`` block all of them are written.
+
+    Raises:
+        OutputError: then, if one could not be written.
+    """
+    written: list[Future[None]] = []
+    with ThreadPoolExecutor(1) as thread:
+        yield lambda *arguments, **named: written.append(thread.submit(write_video, *arguments, **named))
+    for one in written:
+        one.result()
 
 
 def _frames(file: Path) -> int:

@@ -25,6 +25,7 @@ from torchrl_ocwm.evaluation import (
     match,
     object_errors,
     picture_objects,
+    predict_objects,
     random_sequences,
     to_json,
     write_html,
@@ -93,7 +94,9 @@ def _errors(agent: Agent, records: TensorDictBase, settings: Diagnosis, output: 
     if errors["imagined"]:
         draw_errors(output / "errors.png", errors, names)
     if isinstance(model, ObjectWorldModel) and settings.video_sequences:
-        picture_objects(output, model, records[: settings.video_sequences], settings.context, names)
+        pictured = records[: settings.video_sequences]
+        views = predict_objects(model, pictured, settings.context)
+        picture_objects(output, pictured, views, settings.context, names)
     return errors
 
 

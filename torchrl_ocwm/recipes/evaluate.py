@@ -27,6 +27,7 @@ from torchrl_ocwm.evaluation import (
     check_ffmpeg,
     goal_images,
     measure,
+    videos_beside,
     write_html,
 )
 from torchrl_ocwm.recipes.config import kept, recipe
@@ -99,11 +100,12 @@ def main(config: Evaluate) -> None:
     drawn = [*draw(report, task, output)]
     if settings.video_goals:
         films = {kind: footage[kind].episodes() for kind in goal_kinds(policies[-1], settings.image_goals)}
-        for kind, episodes in films.items():
-            seen = images[chosen] if images is not None and kind == IMAGE_GOALS else None
-            film(policies[-1], episodes, goals[chosen], settings.seed, output / FILMS[kind], seen)
-        drawn += [FILMS[kind] for kind in films]
-        drawn += picture_episodes(policies[-1].agent, next(iter(films.values())), output)
+        with videos_beside() as write:
+            for kind, episodes in films.items():
+                seen = images[chosen] if images is not None and kind == IMAGE_GOALS else None
+                film(policies[-1], episodes, goals[chosen], settings.seed, output / FILMS[kind], seen, write=write)
+            drawn += [FILMS[kind] for kind in films]
+            drawn += picture_episodes(policies[-1].agent, next(iter(films.values())), output, write=write)
     page = write_html(output, f"Evaluation on {task.name}", report.markdown(), drawn, kept(config, output))
     print(f"\ntable, numbers, pictures, videos: {output}; all on one page: {page}")
 

@@ -13,6 +13,7 @@ from torchrl_ocwm.agents import Agent, Policy
 from torchrl_ocwm.envs import Task, environment_of, make_scene
 from torchrl_ocwm.evaluation import (
     Report,
+    WriteVideo,
     decode_video,
     draw_errors,
     episode_records,
@@ -22,6 +23,7 @@ from torchrl_ocwm.evaluation import (
     mark,
     object_errors,
     picture_objects,
+    predict_objects,
     tile,
     write_video,
 )
@@ -50,7 +52,14 @@ def draw(report: Report, task: Task, output: Path) -> list[str]:
 
 
 def film(
-    policy: Policy, episodes: TensorDictBase, goals: Tensor, seed: int, file: Path, images: Tensor | None = None
+    policy: Policy,
+    episodes: TensorDictBase,
+    goals: Tensor,
+    seed: int,
+    file: Path,
+    images: Tensor | None = None,
+    *,
+    write: WriteVideo = write_video,
 ) -> None:
     """A few of the episodes that were scored: what happened, the goal as a cross.
 
@@ -65,17 +74,20 @@ def film(
     rows = [mark(episodes["transition", "next", "pixels"], points), mark(imagined, points)]
     if images is not None:
         rows.insert(0, images.unsqueeze(1).expand_as(rows[0]))
-    write_video(file, tile(rows))
+    write(file, tile(rows))
 
 
-def picture_episodes(agent: Agent, episodes: TensorDictBase, output: Path) -> tuple[str, ...]:
+def picture_episodes(
+    agent: Agent, episodes: TensorDictBase, output: Path, *, write: WriteVideo = write_video
+) -> tuple[str, ...]:
     """What an object-centric world model sees and imagines of the objects in these episodes; names of the files."""
     if not isinstance(agent.model, ObjectWorldModel):
         return ()
     records = episode_records(episodes)
     context = min(CONTEXT, records.shape[1] - 1)
-    picture_objects(output, agent.model, records, context, agent.task.objects)
-    draw_errors(output / "errors.png", object_errors(agent.model, records, context), agent.task.objects)
+    views = predict_objects(agent.model, records, context)
+    picture_objects(output, records, views, context, agent.task.objects, write=write)
+    draw_errors(output / "errors.png", object_errors(agent.model, records, context, views=views), agent.task.objects)
     return ("objects.png", "objects.mp4", "errors.png")
 
 
