@@ -64,6 +64,7 @@ def test_what_others_took_counts(tmp_path: Path) -> None:
 def test_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     keep(DATA, tmp_path, 200.0)
     monkeypatch.setattr(Trained, "reached", lambda self, root: 20)
+    monkeypatch.setattr(Collected, "reached", lambda self, root: self.work)
     found = forecast(RUNS, tmp_path, Machine())
     assert [(one.state, one.seconds, one.done) for one in found] == [
         ("done", 200, True),

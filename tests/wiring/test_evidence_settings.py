@@ -119,6 +119,22 @@ def test_dry_run(reproduce: Callable[..., SimpleNamespace], tmp_path: Path) -> N
     assert said.endswith("page: " + str(tmp_path / "outputs" / "evidence" / "README.md") + "\n")
 
 
+@shows("Reproduce.include")
+def test_include(
+    reproduce: Callable[..., SimpleNamespace],
+    scripts: dict[str, ModuleType],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    """Pages are taken over before it is said what there is to do."""
+    asked: list[Any] = []
+    monkeypatch.setattr(scripts["reproduce"], "include", lambda *given: asked.append(given) or ["x", "y"])
+    seen = reproduce("include=[one,two]", "workers=1")
+    wanted = seen.page[1]
+    assert asked == [(folder, wanted, tmp_path / "outputs" / "evidence") for folder in ("one", "two")]
+    assert seen.said.startswith("one: 2 evaluations taken over\ntwo: 2 evaluations taken over\n| run |")
+
+
 @shows("Reproduce.output")
 def test_output(reproduce: Callable[..., SimpleNamespace], tmp_path: Path) -> None:
     seen = reproduce("output=there")

@@ -3,11 +3,12 @@
 Needs the extra ``recipes``.
 """
 
+from torchrl_ocwm.evidence.earlier import include
 from torchrl_ocwm.evidence.estimate import Forecast, forecast, table
 from torchrl_ocwm.evidence.figures import BUDGETS, FIGURES, SETUPS, Budget, Figure, Result, Row, Setup, results
 from torchrl_ocwm.evidence.launchers import LAUNCHERS, Launcher
 from torchrl_ocwm.evidence.page import write_page
-from torchrl_ocwm.evidence.queue import RunFailedError, in_order, work_off
+from torchrl_ocwm.evidence.queue import RunFailedError, in_order, to_do, work_off
 from torchrl_ocwm.evidence.records import Record, RecordError
 from torchrl_ocwm.evidence.runs import Collected, Evaluated, Explored, Run, Trained
 from torchrl_ocwm.evidence.settings import Evidence, Machine
@@ -37,9 +38,11 @@ __all__ = [
     "Trained",
     "forecast",
     "in_order",
+    "include",
     "results",
     "share",
     "table",
+    "to_do",
     "work_off",
     "write_page",
 ]

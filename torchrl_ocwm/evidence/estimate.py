@@ -15,6 +15,7 @@ import torch
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
 from torchrl_ocwm.envs import Task, make_env, make_task
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs
+from torchrl_ocwm.evidence.queue import to_do
 from torchrl_ocwm.evidence.records import RECORD, Record
 from torchrl_ocwm.evidence.runs import UPDATE_RATIO, Collected, Evaluated, Explored, Run, Trained
 from torchrl_ocwm.evidence.settings import Machine
@@ -47,13 +48,13 @@ class Forecast:
 def forecast(runs: Sequence[Run], root: Path, how: Machine) -> list[Forecast]:
     """How far each run is, and how long it will take: as long as others of its kind did here, or by a short timing."""
     paces = Paces(root, how)
-    return [_forecast(run, root, paces) for run in runs]
+    names = to_do(runs, root)
+    return [_forecast(run, root, paces, done=run.name not in names) for run in runs]
 
 
-def _forecast(run: Run, root: Path, paces: Paces) -> Forecast:
-    record = Record.of(run, root)
-    if record.done:
-        return Forecast(run, "done", record.seconds, True)
+def _forecast(run: Run, root: Path, paces: Paces, *, done: bool) -> Forecast:
+    if done:
+        return Forecast(run, "done", Record.of(run, root).seconds, True)
     reached = run.reached(root)
     seconds = _START + paces[run] * max(0, run.work - reached)
     return Forecast(run, f"{reached:,} of {run.work:,}" if reached else "to do", seconds, False)

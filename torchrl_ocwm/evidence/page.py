@@ -11,6 +11,7 @@ from torchrl_ocwm.envs import make_task
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, metric_lines, read_scalar
 from torchrl_ocwm.evaluation.report import COLUMNS, Report, ReportError
+from torchrl_ocwm.evidence.earlier import CURVES, IMAGE_GOALS, METRIC, RANDOM, random_run, save_records
 from torchrl_ocwm.evidence.estimate import in_words
 from torchrl_ocwm.evidence.figures import FIGURES, Figure, Result
 from torchrl_ocwm.evidence.queue import in_order
@@ -18,8 +19,7 @@ from torchrl_ocwm.evidence.records import Record
 from torchrl_ocwm.evidence.runs import Run, written
 from torchrl_ocwm.evidence.settings import Evidence
 
-IMAGE_GOALS = ", image goals"  # as ``ocwm evaluate`` names rows
-CURVE = {"evaluation/final_score": "final score, landmark goals"}
+CURVE = {METRIC: "final score, landmark goals"}
 
 
 def write_page(wanted: Evidence, results: Sequence[Result], root: Path) -> Path:
@@ -52,6 +52,7 @@ def write_page(wanted: Evidence, results: Sequence[Result], root: Path) -> Path:
     page = folder / "README.md"
     with writing(page) as file:
         file.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    save_records(folder, {name: record for name, record in records.items() if record.done})
     return page
 
 
@@ -77,8 +78,8 @@ def read_report(done: Iterable[Result], root: Path) -> Report:
 
 def _add(report: Report, one: Result, name: str, metrics: dict) -> None:
     """A row of one evaluation, which has one seed. Random actions count once, whoever they were played beside."""
-    seed = f"seed {one.evaluated.trained.seed}"
-    if name == "random":
+    seed = random_run(one.evaluated.trained.seed)
+    if name == RANDOM:
         if seed not in getattr(report.rows.get(name), "runs", ()):
             report.add(name, metrics, source="smooth actions", run=seed)
         return
@@ -99,8 +100,8 @@ def _section(env: str, figure: Figure, done: Sequence[Result], root: Path, folde
         elif kind == "curves":
             if not learning_curves(place / "curves.png", _folders(done, root), CURVE):
                 continue
-            _save_curves(place / "curves.csv", _folders(done, root))
-            numbers += f" Update by update: [curves.csv]({env}/curves.csv)."
+            _save_curves(place / CURVES, _folders(done, root))
+            numbers += f" Update by update: [{CURVES}]({env}/{CURVES})."
         else:
             metric_lines(place / "lines.png", _lines(figure, done, report), figure.places)
         pictures.append(f"![{kind}]({env}/{kind}.png)")
@@ -115,13 +116,12 @@ def _section(env: str, figure: Figure, done: Sequence[Result], root: Path, folde
 
 def _save_curves(path: Path, runs: dict[str, list[Path]]) -> None:
     """The numbers of the curves: one line for each score of each run."""
-    metric = next(iter(CURVE))
     with writing(path) as new, new.open("w", newline="", encoding="utf-8") as file:
         lines = csv.writer(file)
-        lines.writerow(["agent", "run", "updates", metric.rpartition("/")[-1]])
+        lines.writerow(["agent", "run", "updates", METRIC.rpartition("/")[-1]])
         for agent, folders in runs.items():
             for folder in folders:
-                for updates, score in zip(*(read_scalar(folder, metric) or ((), ())), strict=True):
+                for updates, score in zip(*(read_scalar(folder, METRIC) or ((), ())), strict=True):
                     lines.writerow([agent, folder.name, updates, f"{score:.4f}"])
 
 

@@ -63,6 +63,20 @@ def in_order(runs: Iterable[Run]) -> list[Run]:
     return list(found.values())
 
 
+def to_do(runs: Sequence[Run], root: Path) -> set[str]:
+    """Names of the runs that have to be done: those that are not, and what these need and is not here.
+
+    Args:
+        runs: The runs, what is needed first (:func:`in_order`).
+        root: Folder of all runs. A record there may be of a run that was done elsewhere.
+    """
+    names = {run.name for run in runs if not Record.of(run, root).done}
+    for run in reversed(runs):
+        if run.name in names:
+            names |= {need.name for need in run.needs if need.reached(root) < need.work}
+    return names
+
+
 def work_off(
     runs: Sequence[Run],
     root: Path,
@@ -71,7 +85,7 @@ def work_off(
     *,
     on_done: Callable[[Run], None] = lambda run: None,  # noqa: ARG005
 ) -> None:
-    """Do the runs that are not done, in their order as far as there is room for them.
+    """Do the runs that are :func:`to_do`, in their order as far as there is room for them.
 
     A run that fails keeps back those that need it; all others are done nevertheless. Ctrl-C and SIGTERM stop what is
     at work, so that the next call goes on from there.
@@ -86,16 +100,18 @@ def work_off(
     Raises:
         RunFailedError: in the end, if some have failed.
     """
-    records = {run.name: Record.of(run, root) for run in runs}
-    done = {name for name, record in records.items() if record.done}
-    left, failed = [run for run in runs if run.name not in done], dict[str, str]()
+    names = to_do(runs, root)
+    left, failed = [run for run in runs if run.name in names], dict[str, str]()
+    done = {run.name for run in runs} - names
     at_work: dict[Future[None], Run] = {}
     with launcher:
         while True:
             while len(at_work) < launcher.slots and (run := _next(left, done)):
                 left.remove(run)
-                # Kept as seen from the root: the folder of all runs may be moved.
-                record = replace(records[run.name], commands=tuple(run.commands(Path(), how)))
+                record = Record.of(run, root)
+                # Commands are kept as seen from the root: the folder of all runs may be moved.
+                seconds, commands = 0.0 if record.done else record.seconds, tuple(run.commands(Path(), how))
+                record = replace(record, commands=commands, seconds=seconds, done=False)
                 job = Job(run, root, run.commands(root, how), record, how.threads, PROGRAM)
                 at_work[launcher.submit(perform, job)] = run
             if not at_work:

@@ -18,6 +18,7 @@ from torchrl_ocwm.evidence import (
     Run,
     forecast,
     in_order,
+    include,
     results,
     table,
     work_off,
@@ -33,10 +34,12 @@ class Reproduce(Evidence, Machine):
     """Settings of the recipe.
 
     Args:
+        include: Folders of pages of this command, of this machine or another. Their runs count as done.
         dry_run: Only say what there is to do, and how long it takes.
         output: Folder of all runs and figures. Give all figures the same.
     """
 
+    include: tuple[str, ...] = ()
     dry_run: bool = False
     output: str = "outputs/evidence"
 
@@ -48,6 +51,8 @@ def main(config: Reproduce) -> None:
     wanted = results(config)
     runs = in_order(one.evaluated for one in wanted)
     root = Path(config.output).absolute()
+    for folder in config.include:
+        print(f"{folder}: {len(include(folder, wanted, root))} evaluations taken over")
     launcher = LAUNCHERS[config.launcher](config)
     rows = {run.name: one.row.name for one in wanted for run in (one.evaluated, one.evaluated.trained)}
     print(table(forecast(runs, root, config), launcher.slots, rows), flush=True)

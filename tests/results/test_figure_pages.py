@@ -1,0 +1,30 @@
+"""The pages of ``ocwm reproduce`` that are kept can be taken over: they have the records of all runs that they list."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from torchrl_ocwm.evidence.earlier import RUNS
+from torchrl_ocwm.evidence.estimate import in_words
+
+PAGES = sorted((Path(__file__).parents[2] / "docs" / "results" / "figures").glob("*/README.md"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
+def test_records_are_those_of_the_page(page: Path) -> None:
+    records = json.loads((page.parent / RUNS).read_text(encoding="utf-8"))
+    text = page.read_text(encoding="utf-8")
+    listed = re.findall(r"^\| ((?:datasets|trainings|evaluations)/\S+) \| .* \| (\w+) \| (.+) \|$", text, re.MULTILINE)
+    assert len(listed) > 3
+    assert [name for name, _, _ in listed] == list(records)
+    for name, commit, wall in listed:
+        record = records[name]
+        assert (record["done"], record["commit"], in_words(record["seconds"])) == (True, commit, wall)
+        assert record["machine"] in text
+    results = json.loads((page.parent / "reacher" / "results.json").read_text(encoding="utf-8"))
+    evaluated = {run for row in results["agents"].values() for run in row["runs"] if run.startswith("evaluations/")}
+    assert evaluated == {name for name in records if name.startswith("evaluations/")}
