@@ -130,6 +130,20 @@ def test_a_default_that_has_changed_since_is_noticed(page: Path, tmp_path: Path)
         to_do(in_order(one.evaluated for one in found), tmp_path)
 
 
+def test_a_page_of_one_environment_of_two(page: Path, tmp_path: Path) -> None:
+    found = results(Evidence(**WANTED, seeds=1, env=("cube_move", "reacher")))
+    assert include(page, found, tmp_path) == [one.evaluated.name for one in found if one.env == "reacher"]
+
+
+def test_a_page_that_has_lost_scores(page: Path, tmp_path: Path) -> None:
+    found = results(Evidence(**WANTED, seeds=1))
+    emptied = Report(torch.zeros(4, 2))
+    emptied.save(page / "reacher")
+    with pytest.raises(RecordError, match=rf"results\.json: has no scores of {found[0].evaluated.name}"):
+        include(page, found, tmp_path)
+    assert not list(tmp_path.glob("evaluations/*/run.json"))
+
+
 @pytest.mark.parametrize("text", ["nothing", "[]", '{"evaluations/x": {"pace": 1}}', '{"evaluations/x": 3}'])
 def test_what_is_no_page_is_refused(page: Path, tmp_path: Path, text: str) -> None:
     found = results(Evidence(**WANTED, seeds=1))

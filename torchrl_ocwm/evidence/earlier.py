@@ -51,18 +51,17 @@ def include(folder: str | Path, wanted: Sequence[Result], root: Path) -> list[st
         The evaluations that were taken over.
 
     Raises:
-        RecordError: if there is no page of :func:`~torchrl_ocwm.evidence.write_page`.
+        RecordError: if there is no page of :func:`~torchrl_ocwm.evidence.write_page`, or one without the scores of a run.
         ReportError: if its results cannot be read.
         OutputError: if the folder of all runs cannot be written.
     """
     folder = Path(folder)
     records, taken = _records(folder / RUNS), []
-    reports = {env: Report.load(folder / env / "results.json") for env in dict.fromkeys(one.env for one in wanted)}
     for one in wanted:
-        name = one.evaluated.name
+        name, results = one.evaluated.name, folder / one.env / "results.json"
         if name not in records or (root / name / RECORD).exists():
             continue
-        _scores(reports[one.env], one).save(root / name)
+        _scores(results, one).save(root / name)
         _curve(folder / one.env / CURVES, Path(one.evaluated.trained.name).name, root / one.evaluated.trained.name)
         for run in in_order([one.evaluated]):  # the evaluation's own comes last: all is there then
             if run.name in records and not (root / run.name / RECORD).exists():
@@ -85,9 +84,9 @@ def _commands(value: dict) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(command) for command in value["commands"])
 
 
-def _scores(report: Report, one: Result) -> Report:
+def _scores(file: Path, one: Result) -> Report:
     """The report of one evaluation, with the rows that it had."""
-    seed, name = one.evaluated.trained.seed, one.evaluated.name
+    report, seed, name = Report.load(file), one.evaluated.trained.seed, one.evaluated.name
     found = Report(report.goals, {**report.settings, "seed": seed})
     for row in report.rows:
         for run, metrics in zip(report.rows[row].runs, report.rows[row].seeds, strict=True):
@@ -96,6 +95,8 @@ def _scores(report: Report, one: Result) -> Report:
                 found.add(one.evaluated.trained.agent + kind, metrics, source=name)
             elif row == RANDOM and run == random_run(seed) and one.evaluated.random:
                 found.add(RANDOM, metrics, source="smooth actions")
+    if not found.rows:
+        raise RecordError(f"{file}: has no scores of {name}, whose record is beside it")
     return found
 
 
