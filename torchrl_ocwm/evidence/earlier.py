@@ -51,7 +51,7 @@ def include(folder: str | Path, wanted: Sequence[Result], root: Path) -> list[st
         The evaluations that were taken over.
 
     Raises:
-        RecordError: if there is no page of :func:`~torchrl_ocwm.evidence.write_page`, or one without the scores of a run.
+        RecordError: if there is no page of :func:`~torchrl_ocwm.evidence.write_page`, or it has lost scores.
         ReportError: if its results cannot be read.
         OutputError: if the folder of all runs cannot be written.
     """
