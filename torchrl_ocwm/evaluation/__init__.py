@@ -19,7 +19,7 @@ from torchrl_ocwm.evaluation.goal_latents import latent_pairs, match
 from torchrl_ocwm.evaluation.html import write_html
 from torchrl_ocwm.evaluation.imagined import imagined_distance, imagined_rollout, predicted_return
 from torchrl_ocwm.evaluation.landmarks import LandmarkEvaluation, can_play
-from torchrl_ocwm.evaluation.objects import object_errors, predict_objects
+from torchrl_ocwm.evaluation.objects import object_errors, predict_latents, predict_objects
 from torchrl_ocwm.evaluation.open_loop import posterior, random_sequences
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.reconstruction import ReconstructionError
@@ -73,6 +73,7 @@ __all__ = [
     "object_errors",
     "picture_objects",
     "posterior",
+    "predict_latents",
     "predict_objects",
     "predicted_return",
     "random_sequences",
