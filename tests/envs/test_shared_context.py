@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from torchrl_ocwm.envs import find_environment, make_scene
+from torchrl_ocwm.envs import shared_context as context_module
 from torchrl_ocwm.envs.camera import Camera
 from torchrl_ocwm.envs.shared_context import shared_context
 
@@ -99,6 +100,16 @@ def test_no_other_thread_shares_it():
 
     with ThreadPoolExecutor(1) as other:
         assert not other.submit(there).result()
+    here.release()
+
+
+def test_no_forked_process_shares_it(monkeypatch):
+    here = shared_context(make_model(), **SIZE)
+    with monkeypatch.context() as patch:
+        patch.setattr(context_module.os, "getpid", lambda: -1)
+        there = shared_context(make_model(), **SIZE)
+    assert there is not here
+    there.release()
     here.release()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 else:
     mujoco = import_mujoco()
 
-_Key = tuple[threading.Thread, bytes]
+_Key = tuple[int, threading.Thread, bytes]
 
 
 class SharedContext:
@@ -95,7 +96,7 @@ def shared_context(
         (None, None)
     """
     with _prepared(model, height, width, multisampling, shadows):
-        key = threading.current_thread(), _digest(model)
+        key = os.getpid(), threading.current_thread(), _digest(model)  # a forked process inherits none that works
         if (context := _CONTEXTS.get(key)) is None:
             context = _CONTEXTS[key] = SharedContext(model)
     context.holders += 1

@@ -48,7 +48,9 @@ def explained(predicted: Tensor, true: Tensor) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkpoints", nargs="+", metavar="CHECKPOINT", help="of agents with one object and a reward head")
+    parser.add_argument(
+        "checkpoints", nargs="+", metavar="CHECKPOINT", help="of agents with one object and a reward head"
+    )
     parser.add_argument("--dataset", required=True)
     parser.add_argument("--sequences", type=int, default=300)
     arguments = parser.parse_args()
