@@ -34,6 +34,25 @@ def test_context_that_cannot_be_made(monkeypatch):
     assert MODEL.vis.global_.offwidth == before
 
 
+def test_what_was_opened_before_the_failure_is_freed(monkeypatch):
+    freed = []
+
+    class Opened:
+        def __init__(self, width, height):
+            pass
+
+        def make_current(self):
+            raise RuntimeError("no more memory")
+
+        def free(self):
+            freed.append(self)
+
+    monkeypatch.setattr(context_module, "context_class", lambda: Opened)
+    with pytest.raises(RuntimeError, match=r"RuntimeError: no more memory"):
+        Camera(MODEL, "top")
+    assert len(freed) == 1
+
+
 @pytest.mark.parametrize("system", ["darwin", "win32"])
 def test_on_other_systems(monkeypatch, system):
     monkeypatch.setattr(sys, "platform", system)

@@ -28,6 +28,7 @@ from torchrl_ocwm.evaluation.objects import (
 )
 from torchrl_ocwm.evaluation.open_loop import open_loop_latents, posterior, random_sequences
 from torchrl_ocwm.evaluation.videos import OpenLoopFilm
+from torchrl_ocwm.recipes import pictures
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
 
 NAN = math.nan
@@ -185,6 +186,22 @@ def test_errors_are_of_what_a_model_has(make_agent: Any) -> None:
     assert list(flat["imagined"]) == ["lower", "median", "upper"]
     blind = make_agent("dreamer", {"world_model.observed": ("proprio", "goal_position")}).model
     assert object_errors(blind, records, 2)["imagined"] == {}
+
+
+def test_pictures_of_episodes_are_written_as_asked(
+    tmp_path: Path, make_agent: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pictures, "episode_records", lambda records: records)
+    agent, records = make_agent("focus_pcp"), random_records(reacher_task(), 2, 6)
+    written: list[tuple[str, int]] = []
+
+    def write(file: Path, frames: Tensor, *, scale: int) -> None:
+        written.append((file.name, len(frames)))
+
+    drawn = pictures.picture_episodes(agent, records, tmp_path, write=write)
+    assert drawn == ("objects.png", "objects.mp4", "errors.png")
+    assert written == [("objects.mp4", 6)]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["errors.png", "objects.png"]
 
 
 class TestGoalLatents:

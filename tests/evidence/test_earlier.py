@@ -32,7 +32,8 @@ def give(root: Path, found: list[Result]) -> None:
     """What evaluations and trainings leave, with scores of their own; of datasets only the record."""
     for number, one in enumerate(found):
         report = Report(torch.arange(1, 5).unsqueeze(-1) * torch.tensor([0.01, 0.01]), {"episode_steps": 3, "seed": 0})
-        for name, shift in (("focus_lcp (changed)", 0.0), ("focus_lcp, image goals", 0.01), ("random", -0.2)):
+        shifts = {"focus_lcp (changed)": 0.0, "focus_lcp, image goals": 0.01, "random": -0.2}
+        for name, shift in list(shifts.items())[: 3 if one.evaluated.random else 1]:
             value = 0.2 + 0.02 * (number if name != "random" else one.evaluated.trained.seed) + shift
             report.add(name, {"final_score": torch.linspace(0, value, 4)}, source=name, run=f"{name} {number}")
         report.save(root / one.evaluated.name)
@@ -73,6 +74,31 @@ def test_a_page_is_made_again_from_a_page(page: Path, tmp_path: Path) -> None:
     for name, row in before.rows.items():
         torch.testing.assert_close(after.rows[name].seeds, row.seeds)
     assert to_do(in_order(one.evaluated for one in found), here) == set()
+
+
+def test_random_actions_go_to_their_seeds_and_to_those_who_played_them(tmp_path: Path) -> None:
+    """In this figure one row of three measures them."""
+    wanted = Evidence(figure="visual_goals", size="debug", goals=4, seeds=2)
+    found, there, here = results(wanted), tmp_path / "there", tmp_path / "here"
+    give(there, found)
+    include(write_page(wanted, found, there).parent, found, here)
+    before, after = (write_page(wanted, found, root).parent / "reacher" / "results.md" for root in (there, here))
+    assert after.read_text() == before.read_text()
+    for one in found:
+        rows = Report.load(here / one.evaluated.name / "results.json").rows
+        assert ("random" in rows) == one.evaluated.random
+        if one.evaluated.random:
+            there_too = Report.load(there / one.evaluated.name / "results.json").rows["random"]
+            torch.testing.assert_close(rows["random"].seeds, there_too.seeds)
+
+
+def test_what_is_not_done_is_on_no_page(page: Path, tmp_path: Path) -> None:
+    found, there = results(Evidence(**WANTED, seeds=2)), tmp_path / "there"
+    run = found[-1].evaluated
+    Record(content=to_dict(run.content), pace=run.pace, work=run.work).write(there / run.name)
+    folder = write_page(Evidence(**WANTED, seeds=2), found, there).parent
+    assert run.name not in (folder / "runs.json").read_text()
+    assert found[0].evaluated.name in (folder / "runs.json").read_text()
 
 
 def test_only_the_rest_is_done(page: Path, tmp_path: Path) -> None:
