@@ -6,7 +6,7 @@
 set -eu
 export MUJOCO_GL=${MUJOCO_GL:-egl} LP_NUM_THREADS=0 OMP_NUM_THREADS=1
 env=$1 agent=$2 size=${SIZE:-cpu} updates=${UPDATES:-12000} goals=${GOALS:-36}
-here=docs/results/meta_world/$env run=outputs/meta_world/$env/$agent/$size/seed_0 data=data/${env}_$agent
+here=docs/results/meta_world/$env/$agent run=outputs/meta_world/$env/$agent/$size/seed_0 data=data/${env}_$agent
 
 python examples/train_online.py agent="$agent" env="$env" size="$size" dataset="$data" output="$run" \
   training.updates="$updates" training.eval_interval=1500 training.threads=1 \
@@ -15,9 +15,9 @@ python examples/train_online.py agent="$agent" env="$env" size="$size" dataset="
   online.round_episodes=60 online.update_ratio=0.5
 
 mkdir -p "$here"
-cp "$run/config.yaml" "$here/${agent}_seed_0.yaml"
-cp "$run/log/scalars/evaluation/final_score.csv" "$here/${agent}_seed_0.csv"
-cp "$run/log/scalars/collected/steps.csv" "$here/${agent}_seed_0_steps.csv"
-python examples/diagnose.py checkpoint="$run/checkpoint.zip" dataset="$data" output="$here/diagnosis_$agent"
-python examples/evaluate.py goals="$goals" episode_steps=60 envs=18 workers=0 output="$here/$agent" \
+cp "$run/config.yaml" "$here/seed_0.yaml"
+cp "$run/log/scalars/evaluation/final_score.csv" "$here/seed_0.csv"
+cp "$run/log/scalars/collected/steps.csv" "$here/seed_0_steps.csv"
+python examples/diagnose.py checkpoint="$run/checkpoint.zip" dataset="$data" output="$here/diagnosis"
+python examples/evaluate.py goals="$goals" episode_steps=60 envs=18 workers=0 output="$here" \
   checkpoint="$run/checkpoint.zip"
