@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import imageio.v3 as imageio
 import imageio_ffmpeg
@@ -23,8 +23,12 @@ from torchrl_ocwm.evaluation.open_loop import open_loop_latents
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.modules import ObjectWorldModel, RSSMWorldModel
 
-#: :func:`write_video`, or one that does not wait for it.
-WriteVideo = Callable[..., object]
+
+class WriteVideo(Protocol):
+    """:func:`write_video`, or what :func:`videos_beside` gives."""
+
+    def __call__(self, path: str | Path, frames: Tensor, *, fps: int = 15, scale: int = 3) -> None:
+        """Write a video, now or soon."""
 
 
 def check_ffmpeg(setting: str) -> None:
@@ -82,8 +86,12 @@ def videos_beside() -> Iterator[WriteVideo]:
         OutputError: then, if one could not be written.
     """
     written: list[Future[None]] = []
+
+    def write(path: str | Path, frames: Tensor, **options: Any) -> None:
+        written.append(thread.submit(write_video, path, frames, **options))
+
     with ThreadPoolExecutor(1) as thread:
-        yield lambda *arguments, **named: written.append(thread.submit(write_video, *arguments, **named))
+        yield write
     for one in written:
         one.result()
 

@@ -1,0 +1,72 @@
+"""What the page of Meta-World says is in the files beside it."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from reading import RESULTS, ROOT, curve, grid, mean, missing, report, settings, unchecked
+
+NAME = "meta_world"
+RUNS = ["shelf_place/focus_pcp"]
+#: What was done, or what the paper says: no file beside the page has these numbers.
+STATED = [
+    "60 steps each, of four control steps",
+    "success within 5 cm",
+    "after 250,000 updates of a larger model the paper reports "
+    "0.59 ± 0.10 for FOCUS + PCP and 0.70 ± 0.08 for FOCUS + LCP",
+    "At commit fff8ad5 on 2026-11-26",
+    "PyTorch 2.13.0 on the CPU: 61 minutes, in some of which it was halted",
+]
+
+
+def sentences(run: str) -> list[str]:
+    name = f"{NAME}/{run}"
+    agent = run.rpartition("/")[-1]
+    numbers, made = report(name), settings(name, "seed_0")
+    scores, first = curve(RESULTS / name / "seed_0.csv"), made["online"]["seed_updates"]
+    *rounds, last = [f"{score:.2f}" for update, score in scores.items() if update > first]
+    assert max(scores) == made["training"]["updates"]
+    assert (made["env"]["options"]["action_repeat"], numbers.settings["episode_steps"]) == (4, 60)
+    steps = max(curve(RESULTS / name / "seed_0_steps.csv").values())
+    found = numbers.rows[agent].seeds[0]
+    expected, real = (mean(numbers, agent, metric, 100) for metric in ("imagined_distance", "final_distance"))
+    looked_at = json.loads((RESULTS / name / "diagnosis" / "diagnosis.json").read_text())
+    after = {
+        view: {kind: 1000 * values[0][14] for kind, values in curves.items()}
+        for view, curves in looked_at["errors"].items()
+    }
+    return [
+        grid(numbers),
+        f"it is {scores[first]:.2f} after {first:,} updates on scripted and random data",
+        f"{', '.join(rounds)} and {last}",
+        f"{made['training']['updates']:,} updates",
+        f"with {steps:,.0f} steps in the dataset",
+        f"more than 5 cm off for {int((found['success'] == 0).sum())} of {len(numbers.goals)} goals",
+        f"expects to end {expected:.1f} cm off on average, where it is {real:.1f}",
+        f"of {looked_at['settings']['sequences']} sequences of its data",
+        f"give the position to {after['filtered']['median']:.0f} mm in the median. "
+        f"After 15 imagined steps it is off by {after['imagined']['median']:.0f} mm",
+        f"({after['unmoved']['median']:.0f} mm)",
+        f"({after['imagined']['upper']:.0f} mm against {after['unmoved']['upper']:.0f} mm)",
+    ]
+
+
+def test_page() -> None:
+    said = [*(sentence for run in RUNS for sentence in sentences(run)), *STATED]
+    assert missing(NAME, said) == []
+    assert unchecked(NAME, said) == []
+
+
+def test_scores_of_the_readme() -> None:
+    found = report(f"{NAME}/shelf_place/focus_pcp")
+    random, ours = (f"{mean(found, row, 'final_score'):.2f}" for row in ("random", "focus_pcp"))
+    said = f"`focus_pcp` scores {ours} on {len(found.goals)} goals, random actions {random}"
+    assert said in " ".join((ROOT / "README.md").read_text().split())
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_tables(run: str) -> None:
+    table = report(f"{NAME}/{run}").markdown()
+    assert (RESULTS / NAME / run / "results.md").read_text() == table + "\n"
+    assert table in (RESULTS / NAME / "README.md").read_text()
