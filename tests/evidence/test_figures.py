@@ -81,7 +81,8 @@ def kind(run: Run) -> tuple[str, ...]:
 
 def test_commands_say_what_runs_are(compose: Callable[..., Any]) -> None:
     """The settings that a recipe reads from the command of a run are those by which the run is found."""
-    every = {kind(run): run for figure in FIGURES for run in runs(figure, size="debug")}
+    environments = ("reacher", "cube_move")
+    every = {kind(run): run for figure in FIGURES for run in runs(figure, size="debug", env=environments)}
     for run in every.values():
         for command, *arguments in run.commands(ROOT, Machine(threads=3)):
             config, content = compose(COMMANDS[command][0], *arguments), run.content
@@ -105,12 +106,28 @@ def test_commands_say_what_runs_are(compose: Callable[..., Any]) -> None:
             if command == "train-online":
                 assert (config.agent, config.size) == (content["agent"], content["size"])
                 assert config.online == content["online"]
+                assert config.training.updates == run.updates
 
 
 def test_a_dataset_of_several_policies_is_collected_in_their_shares(compose: Callable[..., Any]) -> None:
-    [data] = [run for run in runs("table", env="cube_move", steps=101) if run.kind == "datasets"]
+    [data] = [run for run in runs("table", env="reacher", steps=101) if run.kind == "datasets"]
     collected = [compose("collect", *arguments) for _, *arguments in data.commands(ROOT, Machine())]
-    assert [(one.policy, one.steps) for one in collected] == [("scripted", 76), ("random", 101)]
+    assert [(one.policy, one.steps) for one in collected] == [("scripted", 50), ("random", 101)]
+
+
+@pytest.mark.parametrize("env", ["cube_move", "shelf_place", "pick_place"])
+def test_half_of_a_hard_task_is_shown_by_an_agent_that_acts(compose: Callable[..., Any], env: str) -> None:
+    """Three quarters of the others' half are scripted; the agent learns from all, in four rounds of its own."""
+    [data] = [run for run in runs("table", env=env) if run.kind == "datasets"]
+    [(command, *arguments)] = data.commands(ROOT, Machine())
+    config = compose(COMMANDS[command][0], *arguments)
+    assert (command, config.agent, config.online.steps) == ("train-online", AGENTS["focus_pcp"], 50_000)
+    assert config.online.seed_policy == ("scripted", "random")
+    assert config.online.seed_steps == (18_750, 6_250)
+    assert (config.online.seed_updates, config.online.update_ratio) == (5_000, 0.4)
+    assert config.training.updates == 5_000 + 10_000
+    rounds = 25_000 / (config.online.round_episodes * config.env.options["horizon"])
+    assert rounds == pytest.approx(4, abs=0.1)
 
 
 @pytest.mark.parametrize("env", ["shelf_place", "pick_place"])

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from torchrl_ocwm.agents import AGENTS, SIZES
-from torchrl_ocwm.evidence import Collected, Evaluated, Explored, Record, RecordError, Trained, runs
+from torchrl_ocwm.evidence import Collected, Evaluated, Explored, Record, RecordError, Trained
 from torchrl_ocwm.evidence.runs import essential
 from torchrl_ocwm.settings import Settings, change, to_dict
 from torchrl_ocwm.testing import random_dataset, reacher_task
@@ -69,7 +69,8 @@ def test_the_same_settings_said_otherwise_are_the_same_run() -> None:
 
 def test_an_explorer_is_known_by_all_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     explored = Explored(env="reacher", explorer="plan2explore", size="debug", steps=100)
-    for other in ({"explorer": "focus_explore"}, {"size": "cpu"}, {"steps": 101}, {"seed": 1}):
+    more = {"policies": {"scripted": 10}}, {"update_ratios": (0.1, 0.2)}, {"round_episodes": 3}
+    for other in ({"explorer": "focus_explore"}, {"size": "cpu"}, {"steps": 101}, {"seed": 1}, *more):
         assert replace(explored, **other).name != explored.name
     other = change(AGENTS["plan2explore"], {"behaviours.explore.reward.members": 3})
     before = replace(explored).name
@@ -133,4 +134,8 @@ def test_how_far_a_run_is(tmp_path: Path) -> None:
 def test_work() -> None:
     assert (DATA.work, TRAINED.work, EVALUATED.work) == (40, 4, 12)
     assert replace(EVALUATED, image_goals=True, random=True).work == 36
-    assert runs.Explored(env="reacher", explorer="plan2explore", size="debug", steps=100).work == 100
+    explored = Explored(env="reacher", explorer="plan2explore", size="debug", steps=100)
+    assert (explored.work, explored.updates) == (100, 10)
+    acting = replace(explored, policies={"scripted": 30, "random": 20}, update_ratios=(0.2, 0.4))
+    assert (acting.work, acting.updates) == (100, 10 + 20)
+    assert acting.pace != explored.pace

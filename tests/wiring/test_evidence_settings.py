@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from rows import shows
 
-from torchrl_ocwm.evidence import Collected, Evaluated, Machine, Run, Trained, estimate, launchers
+from torchrl_ocwm.evidence import Collected, Evaluated, Explored, Machine, Run, Trained, estimate, launchers
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def reproduce(
     return go
 
 
-def of_kind(seen: SimpleNamespace, kind: type) -> list[Any]:
+def of_kind(seen: SimpleNamespace, kind: type | tuple[type, ...]) -> list[Any]:
     return [run for run in seen.runs if isinstance(run, kind)]
 
 
@@ -55,9 +55,9 @@ def test_figure(reproduce: Callable[..., SimpleNamespace]) -> None:
 
 @shows("Evidence.env")
 def test_environments(reproduce: Callable[..., SimpleNamespace]) -> None:
-    assert [run.env for run in of_kind(reproduce("env=cube_move"), Collected)] == ["cube_move"]
+    assert [run.env for run in of_kind(reproduce("env=cube_move"), Explored)] == ["cube_move"]
     both = reproduce("env=[reacher,cube_move]")
-    assert [run.env for run in of_kind(both, Collected)] == ["reacher", "cube_move"]
+    assert [run.env for run in of_kind(both, (Collected, Explored))] == ["reacher", "cube_move"]
     assert "unknown environment 'nowhere'" in reproduce("env=nowhere").said
 
 
@@ -77,7 +77,7 @@ def test_size(reproduce: Callable[..., SimpleNamespace]) -> None:
 def test_how_much(reproduce: Callable[..., SimpleNamespace]) -> None:
     seen = reproduce("seeds=2", "steps=70", "updates=9", "goals=16", "env=cube_move")
     assert [run.seed for run in of_kind(seen, Trained)] == [0] * 4 + [1] * 4
-    assert [run.work for run in of_kind(seen, Collected)] == [70]
+    assert [run.work for run in of_kind(seen, Explored)] == [70]
     assert {run.updates for run in of_kind(seen, Trained)} == {9}
     assert {run.goals for run in of_kind(seen, Evaluated)} == {16}
 

@@ -17,7 +17,7 @@ from torchrl_ocwm.envs import Task, make_env, make_task
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs
 from torchrl_ocwm.evidence.queue import to_do
 from torchrl_ocwm.evidence.records import RECORD, Record
-from torchrl_ocwm.evidence.runs import UPDATE_RATIO, Collected, Evaluated, Explored, Run, Trained
+from torchrl_ocwm.evidence.runs import Collected, Evaluated, Explored, Run, Trained
 from torchrl_ocwm.evidence.settings import Machine
 from torchrl_ocwm.origin import machine
 from torchrl_ocwm.settings import change
@@ -120,7 +120,7 @@ class Paces:
             return seconds_of_a_step(run)
         if isinstance(run, Explored):
             agent = _agent(make_task(run.env, **run.options), run.explorer, run.size)
-            return seconds_of_a_step(run) + UPDATE_RATIO * seconds_of_an_update(agent, self.how)
+            return seconds_of_a_step(run) + run.updates / run.steps * seconds_of_an_update(agent, self.how)
         assert isinstance(run, (Trained, Evaluated))
         trained = run.trained if isinstance(run, Evaluated) else run
         task = make_task(trained.data.env, **trained.data.options)

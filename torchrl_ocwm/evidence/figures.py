@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from torchrl_ocwm.evidence.runs import Collected, Evaluated, Explored, Trained
+from torchrl_ocwm.evidence.runs import Collected, Evaluated, Explored, Trained, all_options
 from torchrl_ocwm.evidence.settings import Evidence
 from torchrl_ocwm.settings import SettingsError
 
@@ -20,7 +20,7 @@ class Row:
         agent: A row of agents.
         changes: Settings of the agent that are otherwise, by dotted names.
         options: Options of the environment that are otherwise.
-        data: Who collects: a policy or an explorer; none: the policies of the environment.
+        data: Who collects: a policy or an explorer; none: those of the environment.
         image_goals: Whether it is evaluated with images as goals too.
         random: Whether random actions are evaluated beside it.
         line: The line of the drawing that it belongs to.
@@ -63,6 +63,7 @@ class Setup:
 
     Args:
         policies: Who collects, and what share of the steps.
+        acting: An agent, a row, whose own steps are the other half; none: policies collect all.
         options: Options of the environment.
         small: Further options at the sizes for a CPU.
         episode_steps: Steps of each evaluated episode.
@@ -70,6 +71,7 @@ class Setup:
     """
 
     policies: Mapping[str, float]
+    acting: str = ""
     options: Mapping[str, Any]
     small: Mapping[str, Any] = field(default_factory=dict)
     episode_steps: int
@@ -125,6 +127,8 @@ _TABLE = (
     Row(name="focus_pcp", agent="focus_pcp"),
     _LCP,
 )
+#: An acting agent: updates per step of others and of its own, and rounds.
+_LEARNING, _ROUNDS = (0.2, 0.4), 4
 #: Pixels of the disc at the goal, where only with or without it is compared.
 _TARGET = 5
 
@@ -219,8 +223,11 @@ FIGURES = {
 }
 
 _BOTH, _MOSTLY_SCRIPTED = {"scripted": 0.5, "random": 0.5}, {"scripted": 0.75, "random": 0.25}
+# On scripted and random steps alone agents believe that they are at the goal, and are not.
+_ACTING = "focus_pcp"
 _CUBE = Setup(
     policies=_MOSTLY_SCRIPTED,
+    acting=_ACTING,
     options={"horizon": 100},
     small={"image_size": 32, "mask_scale": 5},
     episode_steps=100,
@@ -229,6 +236,7 @@ _CUBE = Setup(
 # The hand starts high above the object: with one control step per action, imagination does not look that far ahead.
 _META_WORLD = Setup(
     policies=_MOSTLY_SCRIPTED,
+    acting=_ACTING,
     options={"horizon": 60, "action_repeat": 4},
     small={"image_size": 32, "mask_scale": 5},
     episode_steps=60,
@@ -301,10 +309,23 @@ def _evaluated(row: Row, env: str, seed: int, wanted: Evidence) -> Evaluated:
 def _data(row: Row, env: str, steps: int, setup: Setup, budget: Budget, size: str) -> Collected | Explored:
     small = setup.small if budget.small else {}
     options = {**setup.options, **small, **budget.options, **row.options}
-    if row.data in ("", "random", "scripted"):
-        shares = {row.data: 1.0} if row.data else setup.policies
-        return Collected(env=env, options=options, policies=dict(_shared_out(steps, shares)))
-    return Explored(env=env, options=options, explorer=row.data, size=size, steps=steps)
+    if row.data in ("random", "scripted"):
+        return Collected(env=env, options=options, policies={row.data: steps})
+    if row.data:
+        return Explored(env=env, options=options, explorer=row.data, size=size, steps=steps)
+    if not setup.acting:
+        return Collected(env=env, options=options, policies=dict(_shared_out(steps, setup.policies)))
+    own = steps // 2
+    return Explored(
+        env=env,
+        options=options,
+        explorer=setup.acting,
+        size=size,
+        steps=steps,
+        policies=dict(_shared_out(steps - own, setup.policies)),
+        update_ratios=_LEARNING,
+        round_episodes=max(1, own // (_ROUNDS * all_options(env, options).horizon)),
+    )
 
 
 def _shared_out(steps: int, shares: Mapping[str, float]) -> Iterator[tuple[str, int]]:

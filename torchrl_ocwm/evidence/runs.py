@@ -140,14 +140,17 @@ class Collected(Run):
 
 @dataclass(frozen=True, kw_only=True)
 class Explored(Run):
-    """A dataset of an explorer, which learns from what it has collected.
+    """A dataset of an agent, which learns from what it has collected.
 
     Args:
         env: Where it is from.
         options: Of the environment, beside its defaults.
-        explorer: A row that explores.
+        explorer: The agent, a row.
         size: Its size.
         steps: Environment steps.
+        policies: Who collects the first steps, and how many; none: a tenth of them are random.
+        update_ratios: Updates per step, of the first steps and of its own.
+        round_episodes: Episodes of a round.
         seed: Seeds all of it.
     """
 
@@ -158,11 +161,14 @@ class Explored(Run):
     explorer: str
     size: str
     steps: int
+    policies: Mapping[str, int] = field(default_factory=dict)
+    update_ratios: tuple[float, float] = (UPDATE_RATIO, UPDATE_RATIO)
+    round_episodes: int = 2
     seed: int = 0
 
     @property
     def prefix(self) -> str:
-        """Environment and explorer."""
+        """Environment and agent."""
         return f"{self.env}-{self.explorer}"
 
     @property
@@ -184,28 +190,42 @@ class Explored(Run):
 
     @property
     def pace(self) -> str:
-        """Simulator, explorer and its size."""
-        return f"explore {self.env} {image_size(self.env, self.options)} {self.explorer} {self.size}"
+        """Simulator, agent, its size, and how much it learns."""
+        much = "" if not self.policies else f" {self.update_ratios[1]}"
+        return f"explore {self.env} {image_size(self.env, self.options)} {self.explorer} {self.size}{much}"
 
     @property
     def updates(self) -> int:
-        """Updates while it explores."""
-        return max(1, round(UPDATE_RATIO * self.steps))
+        """Updates while it collects."""
+        own = self.steps - sum(self._first.values())
+        return max(1, self._online.seed_updates + round(self.update_ratios[1] * own))
+
+    @property
+    def _first(self) -> Mapping[str, int]:
+        return self.policies or {"random": max(1, round(SEED_STEPS * self.steps))}
 
     @property
     def _online(self) -> Online:
-        seeded = max(1, round(SEED_STEPS * self.steps))
-        first = max(1, round(SEED_STEPS * self.updates))
-        return Online(steps=self.steps, seed_steps=(seeded,), seed_updates=first, update_ratio=UPDATE_RATIO, workers=0)
+        return Online(
+            steps=self.steps,
+            seed_policy=tuple(self._first),
+            seed_steps=tuple(self._first.values()),
+            seed_updates=max(1, round(self.update_ratios[0] * sum(self._first.values()))),
+            update_ratio=self.update_ratios[1],
+            round_episodes=self.round_episodes,
+            workers=0,
+        )
 
     def commands(self, root: Path, machine: Machine) -> list[Command]:
         """``ocwm train-online``."""
         online = self._online
         settings = {
             "steps": online.steps,
+            "seed_policy": list(online.seed_policy),
             "seed_steps": list(online.seed_steps),
             "seed_updates": online.seed_updates,
             "update_ratio": online.update_ratio,
+            "round_episodes": online.round_episodes,
             "workers": online.workers,
         }
         training = {"seed": self.seed, "updates": self.updates, "eval_interval": 0, "video_interval": 0}
