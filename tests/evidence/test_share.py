@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,14 +16,20 @@ from torchrl_ocwm.agents import build_agent
 from torchrl_ocwm.data import Collection, collect
 from torchrl_ocwm.envs import make_task
 from torchrl_ocwm.evaluation import Report
-from torchrl_ocwm.evidence import Collected, Evaluated, Record, RecordError, Trained, share
+from torchrl_ocwm.evidence import Collected, Evaluated, Explored, Record, RecordError, Trained, share
 from torchrl_ocwm.testing import reacher_task
+
+
+COLLECTED = Collected(env="reacher", options={"image_size": 16}, policies={"scripted": 30, "random": 12})
 
 
 @pytest.fixture
 def evaluated(tmp_path: Path) -> Path:
     """An evaluation of a tiny agent as ``reproduce`` leaves it, and its training."""
-    data = Collected(env="reacher", options={"image_size": 16}, policies={"scripted": 30, "random": 12})
+    return make_evaluated(tmp_path, COLLECTED)
+
+
+def make_evaluated(tmp_path: Path, data: Collected | Explored) -> Path:
     trained = Trained(data=data, agent="dreamer_pcp", size="debug", seed=3, updates=1_200)
     run = Evaluated(trained=trained, goals=1, episode_steps=7)
     agent = build_agent("dreamer_pcp", make_task("reacher", image_size=16), "debug")
@@ -52,6 +59,20 @@ def test_agent_and_card(evaluated: Path, tmp_path: Path) -> None:
     assert "| commit | abc, evaluated at def |" in card
     assert "1 goals on a grid over the workspace, 7 steps each" in card
     assert "| dreamer_pcp | 1 | 0.75 |" in card
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"policies": {"scripted": 30, "random": 12}}, "30 scripted steps and 12 random steps, and 1,958"),
+        ({}, "200 random steps, and 1,800"),
+    ],
+)
+def test_card_of_data_of_an_agent(tmp_path: Path, more: dict[str, Any], said: str) -> None:
+    options = {"image_size": 16}
+    data = Explored(env="reacher", options=options, explorer="focus_pcp", size="debug", steps=2_000, **more)
+    card = (share(make_evaluated(tmp_path, data), tmp_path / "shared") / "README.md").read_text()
+    assert f"| data | {said} of an agent that learnt meanwhile, seed 0 |" in card
 
 
 def test_runs_may_have_been_moved(evaluated: Path, tmp_path: Path) -> None:

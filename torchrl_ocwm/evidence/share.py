@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -62,13 +62,29 @@ def _of_reproduce(evaluation: Path) -> tuple[Path, dict[str, str]]:
     else:
         raise RecordError(f"{evaluation}: its training is not in {evaluation.parents[1] / 'trainings'}")
     data, training = trained.content["data"], trained.content["training"]
-    steps = " and ".join(f"{count:,} {policy} steps" for policy, count in data.get("policies", []))
     return folder / CHECKPOINT, {
-        "data": f"{steps or 'steps of an explorer'}, seed {data['seed']}",
+        "data": f"{_steps(data)}, seed {data['seed']}",
         "training": f"{training['updates']:,} updates, seed {training['seed']}, {in_words(trained.seconds)}",
         "machine": trained.machine,
         "commit": f"{trained.commit}, evaluated at {record.commit}",
     }
+
+
+def _steps(data: dict[str, Any]) -> str:
+    """Whose the steps of a dataset are: of policies, and of an agent that learnt meanwhile."""
+    if "policies" in data:
+        return _in_words(data["policies"])
+    online = data["online"]
+    own = online["steps"] - sum(online["seed_steps"])
+    return f"{_first(online)}, and {own:,} of an agent that learnt meanwhile"
+
+
+def _first(online: Mapping[str, Any]) -> str:
+    return _in_words(zip(online["seed_policy"], online["seed_steps"], strict=True))
+
+
+def _in_words(steps: Iterable[tuple[str, int]]) -> str:
+    return " and ".join(f"{count:,} {policy} steps" for policy, count in steps)
 
 
 def _agree(trained: dict[str, Any], evaluated: dict[str, Any]) -> bool:
@@ -114,9 +130,7 @@ def _made(file: Path) -> dict[str, str]:
 def _data(config: Mapping[str, Any], folder: Path) -> str:
     """Who collected what a run in a folder learnt from, as far as its settings and its dataset say."""
     if (online := config.get("online")) is not None:
-        seeded = zip(online["seed_steps"], online["seed_policy"], strict=True)
-        first = " and ".join(f"{count:,} {policy} steps" for count, policy in seeded)
-        return f"{first}, and then its own, {online['update_ratio']} updates per step"
+        return f"{_first(online)}, and then its own, {online['update_ratio']} updates per step"
     try:
         with EpisodeDataset.open(folder / config["dataset"]) as dataset:
             policies = dataset.metadata.get("policies", {})
