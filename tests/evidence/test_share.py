@@ -19,7 +19,6 @@ from torchrl_ocwm.evaluation import Report
 from torchrl_ocwm.evidence import Collected, Evaluated, Explored, Record, RecordError, Trained, share
 from torchrl_ocwm.testing import reacher_task
 
-
 COLLECTED = Collected(env="reacher", options={"image_size": 16}, policies={"scripted": 30, "random": 12})
 
 
