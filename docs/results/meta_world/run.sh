@@ -19,5 +19,5 @@ cp "$run/config.yaml" "$here/seed_0.yaml"
 cp "$run/log/scalars/evaluation/final_score.csv" "$here/seed_0.csv"
 cp "$run/log/scalars/collected/steps.csv" "$here/seed_0_steps.csv"
 python examples/diagnose.py checkpoint="$run/checkpoint.zip" dataset="$data" output="$here/diagnosis"
-python examples/evaluate.py goals="$goals" episode_steps=60 envs=18 workers=0 output="$here" \
+python examples/evaluate.py goals="$goals" image_goals=true episode_steps=60 envs=18 workers=0 output="$here" \
   checkpoint="$run/checkpoint.zip"
