@@ -102,7 +102,11 @@ def test_scores_of_the_readme() -> None:
     shelf, place = (f"{mean(one, 'focus_pcp', 'final_score'):.2f}" for one in found)
     (random,) = {f"{mean(one, 'random', 'final_score'):.2f}" for one in found}
     said = f"`focus_pcp` scores {shelf} and {place} on {len(found[0].goals)} goals, random actions {random}"
-    assert said in " ".join((ROOT / "README.md").read_text().split())
+    lcp = report(f"{NAME}/shelf_place/focus_lcp")
+    positions, images = (f"{mean(lcp, row, 'final_score'):.2f}" for row in ("focus_lcp", "focus_lcp, image goals"))
+    text = " ".join((ROOT / "README.md").read_text().split())
+    assert said in text
+    assert f"after 9,000, `focus_lcp` scores {positions} on Shelf place, with images {images}" in text
 
 
 @pytest.mark.parametrize("run", [*RUNS, "shelf_place/focus_lcp"])
