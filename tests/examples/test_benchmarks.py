@@ -155,7 +155,8 @@ def test_speed_of_an_evaluation_adds_up(tmp_path: Path) -> None:
     assert sum(seconds.values()) == pytest.approx(total, abs=0.05 * (len(seconds) + 1))  # rounded numbers
     shares = {name: float(share) for name, _, share in rows[:-2]}
     assert all(0 <= share <= 1 for share in shares.values())
-    assert min(seconds["writing of videos"], seconds["everything else, such as imports"]) > 0
+    assert min(seconds["pictures of objects"], seconds["everything else, such as imports"]) > 0
+    assert seconds["writing of videos"] == 0  # a thread beside does it
 
 
 def test_colour_masks_find_more_from_more_frames(
