@@ -24,6 +24,14 @@ def predict_latents(model: RSSMWorldModel, records: TensorDictBase, context: int
     Returns:
         ``filtered``: all frames are seen; ``imagined``: those of the context only. Each ``[N, T]`` with ``state`` and
         ``belief``.
+
+    Examples:
+        >>> from torchrl_ocwm.agents import build_agent
+        >>> from torchrl_ocwm.testing import random_records, reacher_task
+        >>> model = build_agent("focus_pcp", reacher_task(), size="debug").model
+        >>> views = predict_latents(model, random_records(reacher_task(), 3, 8), context=2)
+        >>> {name: tuple(latents.shape) for name, latents in views.items()}
+        {'filtered': (3, 8), 'imagined': (3, 8)}
     """
     return {
         "filtered": posterior(model, records, "state", "belief"),
@@ -35,6 +43,14 @@ def predict_objects(model: ObjectWorldModel, records: TensorDictBase, context: i
     """:func:`predict_latents` with the ``colours`` and ``masks`` of :func:`decode_objects`.
 
     These take 64 KiB for each object in an image of 64 x 64.
+
+    Examples:
+        >>> from torchrl_ocwm.agents import build_agent
+        >>> from torchrl_ocwm.testing import random_records, reacher_task
+        >>> model = build_agent("focus_pcp", reacher_task(), size="debug").model
+        >>> views = predict_objects(model, random_records(reacher_task(), 3, 8), context=2)
+        >>> views["imagined"]["masks"].shape
+        torch.Size([3, 8, 2, 64, 64])
     """
     views = predict_latents(model, records, context)
     for latents in views.values():

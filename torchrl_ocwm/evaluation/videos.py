@@ -84,6 +84,14 @@ def videos_beside() -> Iterator[WriteVideo]:
 
     Raises:
         OutputError: then, if one could not be written.
+
+    Examples:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp(), "black.mp4")
+        >>> with videos_beside() as write:
+        ...     write(file, torch.zeros(2, 3, 8, 8, dtype=torch.uint8))
+        >>> file.exists()
+        True
     """
     written: list[Future[None]] = []
 

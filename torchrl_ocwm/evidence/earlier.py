@@ -75,13 +75,9 @@ def _records(file: Path) -> dict[str, Record]:
         raise RecordError(f"{file}: not there; include names the folder of a page that `ocwm reproduce` has written")
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
-        return {name: Record(**{**value, "commands": _commands(value)}) for name, value in values.items()}
-    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
+        return {name: Record(**value) for name, value in values.items()}
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise RecordError(f"{file}: not the records of a page's runs ({error!r})") from error
-
-
-def _commands(value: dict) -> tuple[tuple[str, ...], ...]:
-    return tuple(tuple(command) for command in value["commands"])
 
 
 def _scores(file: Path, one: Result) -> Report:
