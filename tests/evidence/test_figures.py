@@ -41,6 +41,7 @@ def test_there_is_a_figure_for_each_name() -> None:
         ("loss_scale", 1, 4),
         ("visual_goals", 1, 3),
         ("fairness", 1, 8),
+        ("goal_latents", 1, 6),
         ("curves", 1, 7),
         ("exploration", 4, 4),
     ],
@@ -69,6 +70,7 @@ def test_figures_share_their_runs() -> None:
     assert names["curves"] == names["table"]
     assert len(names["visual_goals"] - names["table"]) == 4  # LEXA's two agents, and their evaluations
     assert len(names["fairness"] & names["table"]) == 5  # the data, and PCP and LCP as they are
+    assert len(names["goal_latents"] & names["fairness"]) == 5  # the data, LCP as it is and with centred latents
     assert len(names["loss_scale"] & names["table"]) == 3  # the data, and Dreamer with weights of 1
     assert len(names["limits"] & names["table"]) == 9
 

@@ -254,6 +254,30 @@ def test_the_distance_reaches_what_encodes_goals(make_agent: Any, records: Tenso
         torch.testing.assert_close(losses[f"loss_model_{name}"], expected)
 
 
+def test_an_annealed_weight_by_hand(make_agent: Any, records: TensorDict) -> None:
+    """100, 100 · 10^(−2/3) … over three updates, and 1 from then on; what is evaluated is no update."""
+    world_model = make_agent("focus_lcp").model.records()
+    once = FOCUSModelLoss(world_model, lambda_positional=1.0)
+    loss = FOCUSModelLoss(world_model, lambda_positional=100.0, positional_annealing=(1.0, 3))
+
+    def weight() -> float:
+        values = []
+        for one in (once, loss):
+            torch.manual_seed(1)
+            values.append(one(records)[0]["loss_model_positional"])
+        return (values[1] / values[0]).item()
+
+    expected = [100.0, 100 ** (2 / 3), 100 ** (1 / 3), 1.0, 1.0]
+    loss.train()
+    first = [weight(), weight()]
+    loss.eval()
+    assert [weight(), weight()] == pytest.approx([expected[2]] * 2, rel=1e-4)
+    again = FOCUSModelLoss(world_model, lambda_positional=100.0, positional_annealing=(1.0, 3))
+    again.load_state_dict(loss.state_dict())
+    loss = again.train()
+    assert [*first, weight(), weight(), weight()] == pytest.approx(expected, rel=1e-4)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -262,6 +286,7 @@ def test_the_distance_reaches_what_encodes_goals(make_agent: Any, records: Tenso
         ({"lambda_image_latent": 1.0}, "lambda_image_latent does nothing.*not write next.image_latent"),
         ({"positional_distance": "cosine"}, "positional_distance does nothing"),
         ({"positional_gradient": "both"}, "positional_gradient does nothing"),
+        ({"positional_annealing": (1.0, 5)}, "positional_annealing does nothing"),
         ({"positional_distance": "cos"}, "positional_distance must be one of 'cosine', 'mse', got 'cos'"),
         ({"positional_gradient": "all"}, "positional_gradient must be one of 'encoder', 'latent', 'both', got 'all'"),
     ],

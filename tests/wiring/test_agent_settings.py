@@ -369,6 +369,21 @@ def test_the_weight_of_the_positional_encoder() -> None:
     assert one != 0
 
 
+@shows("ObjectLatent.final_weight", "ObjectLatent.annealing_updates")
+def test_the_weight_of_the_positional_encoder_moves() -> None:
+    """From 100 to 4 in two updates by way of 20, and no further."""
+    agent = make("focus_lcp", {f"{REACH}.goal.final_weight": 4, f"{REACH}.goal.annealing_updates": 2})
+    same = loss("loss_model_positional", "focus_lcp", {f"{REACH}.goal.weight": 1})
+    for weight in (100, 20, 4, 4):
+        torch.testing.assert_close(losses(agent)["loss_model_positional"], weight * same)
+    for changes, message in (
+        ({"weight": 0, "final_weight": 4}, "final_weight needs a weight above 0"),
+        ({"annealing_updates": 2}, "annealing_updates does nothing without a final_weight"),
+    ):
+        with pytest.raises(SettingsError, match=message):
+            make("focus_lcp", {f"{REACH}.goal.{name}": value for name, value in changes.items()})
+
+
 @shows("ObjectLatent.distance")
 def test_the_distance_that_the_positional_encoder_learns_by() -> None:
     """The cosine sees directions only, so that all goals are brought to one length; the squared error sees lengths."""

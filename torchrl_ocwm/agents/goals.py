@@ -91,20 +91,33 @@ class ObjectLatent(Goal):
         weight: Weight of the loss of the latent positional encoder, which learns that latent.
         distance: How far apart two latents are in that loss: minus the cosine similarity, or the mean squared error.
         gradient: What that loss trains: the encoder, the object latents that it aims at, or both.
+        final_weight: Weight in the end, which the weight moves to by the same factor at each update; none: it stays.
+        annealing_updates: After how many updates it is that.
     """
 
     weight: float = setting(1.0, at_least=0)
     distance: Literal["cosine", "mse"] = "cosine"
     gradient: Literal["encoder", "latent", "both"] = "both"
+    final_weight: float | None = setting(None, above=0)
+    annealing_updates: int = setting(1000, at_least=1)
+
+    def validate(self) -> None:
+        """A weight of 0 cannot move by factors, and one that stays needs no updates."""
+        if self.final_weight is not None and self.weight == 0:
+            raise SettingsError("final_weight needs a weight above 0 to start from")
+        if self.final_weight is None and self.annealing_updates != ObjectLatent.annealing_updates:
+            raise SettingsError("annealing_updates does nothing without a final_weight")
 
     @property
     def needs(self) -> Mapping[str, Any]:
         """A positional encoder, and how it is trained."""
-        loss = {
+        loss: dict[str, Any] = {
             "lambda_positional": self.weight,
             "positional_distance": self.distance,
             "positional_gradient": self.gradient,
         }
+        if self.final_weight is not None:
+            loss["positional_annealing"] = (self.final_weight, self.annealing_updates)
         return {"positional_encoder": loss}
 
     def build(self, scene: Scene) -> GoalEncoding:

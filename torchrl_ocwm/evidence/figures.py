@@ -120,6 +120,9 @@ _IN_UNITS = {"behaviours.reach.reward.unit": "workspace"}
 _PAPERS_LCP = {"behaviours.reach.goal.weight": 1, "behaviours.reach.reward": "latent_similarity"}
 _CENTRED = {"behaviours.reach.reward.centred": True}
 _SHOWN = {_GOALS: "frames"}
+_LIGHT = {"behaviours.reach.goal.weight": 1}
+_ANNEALED = {"behaviours.reach.goal.final_weight": 1, "behaviours.reach.goal.annealing_updates": 1500}
+_ENCODER = {"behaviours.reach.goal.gradient": "encoder"}
 _TABLE = (
     *_both("dreamer"),
     _PCP,
@@ -208,6 +211,23 @@ FIGURES = {
             Row(name="focus_lcp, cosine and weight 1", agent="focus_lcp", changes=_PAPERS_LCP, image_goals=True),
             Row(name="focus_lcp, centred latents", agent="focus_lcp", changes=_CENTRED, image_goals=True),
             Row(name="focus_lcp, goals that the data shows", agent="focus_lcp", changes=_SHOWN, image_goals=True),
+        ),
+        draws=("heatmap", "curves"),
+    ),
+    "goal_latents": Figure(
+        title="How the latents of objects and of goals are made alike",
+        rows=(
+            _LCP,
+            Row(name="focus_lcp, weight 1", agent="focus_lcp", changes=_LIGHT, image_goals=True),
+            Row(name="focus_lcp, weight from 100 to 1", agent="focus_lcp", changes=_ANNEALED, image_goals=True),
+            Row(name="focus_lcp, centred latents", agent="focus_lcp", changes=_CENTRED, image_goals=True),
+            Row(name="focus_lcp, only the encoder learns", agent="focus_lcp", changes=_ENCODER, image_goals=True),
+            Row(
+                name="focus_lcp, only the encoder learns, centred latents",
+                agent="focus_lcp",
+                changes=_ENCODER | _CENTRED,
+                image_goals=True,
+            ),
         ),
         draws=("heatmap", "curves"),
     ),

@@ -27,7 +27,17 @@ class Evidence(Settings):
         SettingsError: for a setting out of its range, with its name.
     """
 
-    figure: Literal["table", "limits", "target_size", "loss_scale", "visual_goals", "fairness", "curves", "exploration"]
+    figure: Literal[
+        "table",
+        "limits",
+        "target_size",
+        "loss_scale",
+        "visual_goals",
+        "fairness",
+        "goal_latents",
+        "curves",
+        "exploration",
+    ]
     env: str | tuple[str, ...] = "reacher"
     size: str = "cpu"
     seeds: int = setting(3, at_least=1, at_most=1000)

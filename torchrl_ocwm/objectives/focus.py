@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
 from torchrl_ocwm.modules.dtypes import flags
+from torchrl_ocwm.objectives.annealing import AnnealedWeight
 from torchrl_ocwm.objectives.world_model import Term, WeightedModelLoss, image_reconstruction
 from torchrl_ocwm.settings import read
 
@@ -129,6 +130,8 @@ class FOCUSModelLoss(WeightedModelLoss):
         lambda_positional: Weight of L_pos.
         positional_distance: ``"cosine"``, the default, or ``"mse"``.
         positional_gradient: What L_pos trains: ``"encoder"``, ``"latent"`` or ``"both"``, the default.
+        positional_annealing: The last weight of L_pos, and after how many updates it has it
+            (:class:`~torchrl_ocwm.objectives.AnnealedWeight`); none: its weight stays.
         kwargs: The arguments of :class:`~torchrl_ocwm.objectives.WeightedModelLoss`, but for ``lambda_pixels``; its
             ``lambda_image_latent`` is about object latents here.
 
@@ -181,6 +184,7 @@ class FOCUSModelLoss(WeightedModelLoss):
         lambda_positional: float | None = None,
         positional_distance: LatentDistance | None = None,
         positional_gradient: PositionalGradient | None = None,
+        positional_annealing: tuple[float, int] | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(world_model, **kwargs)
@@ -189,15 +193,19 @@ class FOCUSModelLoss(WeightedModelLoss):
             object_pixels=lambda_object_pixels,
             positional=lambda_positional,
         )
-        for name, value in (("positional_distance", positional_distance), ("positional_gradient", positional_gradient)):
+        others = {"distance": positional_distance, "gradient": positional_gradient, "annealing": positional_annealing}
+        for name, value in others.items():
             if value is not None:
-                self._given[name] = "positional"
+                self._given[f"positional_{name}"] = "positional"
         self.positional_distance: LatentDistance = read(
             LatentDistance, positional_distance or "cosine", "positional_distance"
         )
         self.positional_gradient: PositionalGradient = read(
             PositionalGradient, positional_gradient or "both", "positional_gradient"
         )
+        if positional_annealing is not None:
+            first = 1.0 if lambda_positional is None else lambda_positional
+            self.lambda_positional = AnnealedWeight(first, *positional_annealing)
 
     def terms(self) -> dict[str, Term]:
         """Masks and masked colours in place of the image, and what the two kinds of goals are encoded with."""

@@ -14,6 +14,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, cosine_similar
 from torchrl.objectives import DreamerV3ModelLoss, categorical_kl_terms, symlog, two_hot_cross_entropy
 
 from torchrl_ocwm.modules.dtypes import flags, unit_image
+from torchrl_ocwm.objectives.annealing import AnnealedWeight
 
 
 def image_reconstruction(prediction: Tensor, target: Tensor) -> Tensor:
@@ -254,11 +255,12 @@ class WeightedModelLoss(DreamerV3ModelLoss):
             ),
         }
 
-    def weight(self, term: str) -> float:
-        """The weight of a term; the position in an image alone has both weights that it is about."""
+    def weight(self, term: str) -> float | Tensor:
+        """The weight of a term now; the position in an image alone has both weights that it is about."""
         if term == "image_position":
-            return self.lambda_image_latent * self.lambda_object_position
-        return getattr(self, f"lambda_{term}")
+            return self.weight("image_latent") * self.weight("object_position")
+        weight = getattr(self, f"lambda_{term}")
+        return weight() if isinstance(weight, AnnealedWeight) else weight
 
     @property
     def predicted(self) -> dict[str, Term]:
