@@ -157,12 +157,18 @@ def test_a_run_that_has_ended_early_is_not_done(work: Callable[..., list[str]], 
     assert work(Stub(title="short")) == ["short", "short"]
 
 
+def need_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray, whose workers find the stubs."""
+    pytest.importorskip("ray")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["local", "ray"])
 def test_several_at_a_time(launcher: Literal["local", "ray"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Two that wait for ever are both at work."""
     if launcher == "ray":
-        pytest.importorskip("ray")
+        need_ray(monkeypatch)
     runs = [Stub(title=title, what="wait") for title in ("one", "two", "three")]
     how = Machine(launcher=launcher, workers=2)
     where = LAUNCHERS[launcher](how)
@@ -255,9 +261,9 @@ def test_ray_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.slow
-def test_on_ray(tmp_path: Path) -> None:
+def test_on_ray(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Two local workers; a failure is told as it is on this machine."""
-    pytest.importorskip("ray")
+    need_ray(monkeypatch)
     how = Machine(launcher="ray", workers=2)
     data, bad = Stub(title="data"), Stub(title="bad", what="fail")
     runs = [data, Stub(title="one", after=(data,)), Stub(title="two", after=(data,)), bad]
