@@ -61,6 +61,18 @@ def test_environments(reproduce: Callable[..., SimpleNamespace]) -> None:
     assert "unknown environment 'nowhere'" in reproduce("env=nowhere").said
 
 
+@shows("Evidence.agents")
+def test_rows_of_some_agents(reproduce: Callable[..., SimpleNamespace]) -> None:
+    """In the figure's order, and with what all of them need; their page has no other rows."""
+    seen = reproduce("figure=table", "agents=[focus_lcp,dreamer]", "seeds=1")
+    assert [run.agent for run in of_kind(seen, Trained)] == ["dreamer", "dreamer", "focus_lcp"]
+    assert len(of_kind(seen, Collected)) == 1
+    wanted, found, _ = seen.page
+    assert [one.row.name for one in found] == ["dreamer, weights 1", "dreamer, weights 200", "focus_lcp"]
+    assert wanted.agents == ("focus_lcp", "dreamer")
+    assert "agents must be of those of figure=loss_scale, dreamer; got 'focus'" in reproduce("agents=[focus]").said
+
+
 @shows("Evidence.size")
 def test_size(reproduce: Callable[..., SimpleNamespace]) -> None:
     """Agents of that size, and as much of everything as goes with it."""

@@ -292,15 +292,24 @@ def results(wanted: Evidence) -> list[Result]:
     """All that a figure needs, seed by seed, so that a whole one is there early.
 
     Raises:
-        SettingsError: for a size or an environment whose steps and updates are not known.
+        SettingsError: for a size or an environment whose steps and updates are not known, or an agent that the figure
+            does not have.
     """
-    rows = FIGURES[wanted.figure].rows
+    rows = _rows(wanted)
     return [
         Result(row=row, env=env, evaluated=_evaluated(row, env, seed, wanted))
         for seed in range(wanted.seeds)
         for env in wanted.environments
         for row in rows
     ]
+
+
+def _rows(wanted: Evidence) -> list[Row]:
+    rows = FIGURES[wanted.figure].rows
+    known = dict.fromkeys(row.agent for row in rows)
+    if odd := [name for name in wanted.agents if name not in known]:
+        raise SettingsError(f"agents must be of those of figure={wanted.figure}, {', '.join(known)}; got {odd[0]!r}")
+    return [row for row in rows if row.agent in (wanted.agents or known)]
 
 
 def _evaluated(row: Row, env: str, seed: int, wanted: Evidence) -> Evaluated:

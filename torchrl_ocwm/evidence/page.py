@@ -145,7 +145,7 @@ def _lines(figure: Figure, done: Sequence[Result], report: Report) -> dict:
 
 def _command(wanted: Evidence) -> str:
     values = {one.name: getattr(wanted, one.name) for one in fields(Evidence)}
-    settings = [f"{name}={written(value)}" for name, value in values.items() if value is not None]
+    settings = [f"{name}={written(value)}" for name, value in values.items() if value not in (None, ())]
     return f"```bash\nocwm reproduce {' '.join(settings)}\n```"
 
 
