@@ -5,13 +5,15 @@ Needs the extra ``recipes``.
 
 from torchrl_ocwm.evidence.earlier import include
 from torchrl_ocwm.evidence.estimate import Forecast, forecast, table
-from torchrl_ocwm.evidence.figures import BUDGETS, FIGURES, SETUPS, Budget, Figure, Result, Row, Setup, results
+from torchrl_ocwm.evidence.figures import FIGURES, Figure, Row
 from torchrl_ocwm.evidence.launchers import LAUNCHERS, Launcher
 from torchrl_ocwm.evidence.page import write_page
+from torchrl_ocwm.evidence.plan import Result, results
 from torchrl_ocwm.evidence.queue import RunFailedError, in_order, to_do, work_off
 from torchrl_ocwm.evidence.records import Record, RecordError
 from torchrl_ocwm.evidence.runs import Collected, Evaluated, Explored, Run, Trained
 from torchrl_ocwm.evidence.settings import Evidence, Machine
+from torchrl_ocwm.evidence.setups import BUDGETS, SETUPS, Budget, Setup
 from torchrl_ocwm.evidence.share import share
 
 __all__ = [

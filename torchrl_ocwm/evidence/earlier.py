@@ -10,7 +10,7 @@ from pathlib import Path
 
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.report import Report
-from torchrl_ocwm.evidence.figures import Result
+from torchrl_ocwm.evidence.plan import Result
 from torchrl_ocwm.evidence.queue import in_order
 from torchrl_ocwm.evidence.records import RECORD, Record, RecordError
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
-
-from torchrl_ocwm.evidence.runs import Collected, Evaluated, Explored, Trained, all_options
-from torchrl_ocwm.evidence.settings import Evidence
-from torchrl_ocwm.settings import SettingsError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,48 +53,6 @@ class Figure:
     places: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Setup:
-    """How an environment is used.
-
-    Args:
-        policies: Who collects, and what share of the steps.
-        acting: An agent, a row, whose own steps are the other half; none: policies collect all.
-        options: Options of the environment.
-        small: Further options at the sizes for a CPU.
-        episode_steps: Steps of each evaluated episode.
-        updates: How many times as many updates as Reacher it needs.
-    """
-
-    policies: Mapping[str, float]
-    acting: str = ""
-    options: Mapping[str, Any]
-    small: Mapping[str, Any] = field(default_factory=dict)
-    episode_steps: int
-    updates: float = 1.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Budget:
-    """How much of everything goes with a size.
-
-    Args:
-        steps: Environment steps of a dataset.
-        updates: Updates of a run on Reacher.
-        goals: Goals of an evaluation.
-        small: Whether environments have their smaller images.
-        options: Options of the environment, above all others.
-        episode_steps: Steps of each evaluated episode; none: those of the environment.
-    """
-
-    steps: int
-    updates: int
-    goals: int = 100
-    small: bool = False
-    options: Mapping[str, Any] = field(default_factory=dict)
-    episode_steps: int | None = None
-
-
 def _weights(entity: float, goal: float) -> dict[str, float]:
     return {"world_model.lambda_object_position": entity, "world_model.lambda_goal_position": goal}
 
@@ -130,8 +84,6 @@ _TABLE = (
     Row(name="focus_pcp", agent="focus_pcp"),
     _LCP,
 )
-#: An acting agent: updates per step of others and of its own, and rounds.
-_LEARNING, _ROUNDS = (0.2, 0.4), 4
 #: Pixels of the disc at the goal, where only with or without it is compared.
 _TARGET = 5
 
@@ -241,131 +193,3 @@ FIGURES = {
         draws=("heatmap", "curves"),
     ),
 }
-
-_BOTH, _MOSTLY_SCRIPTED = {"scripted": 0.5, "random": 0.5}, {"scripted": 0.75, "random": 0.25}
-# On scripted and random steps alone agents believe that they are at the goal, and are not.
-_ACTING = "focus_pcp"
-_CUBE = Setup(
-    policies=_MOSTLY_SCRIPTED,
-    acting=_ACTING,
-    options={"horizon": 100},
-    small={"image_size": 32, "mask_scale": 5},
-    episode_steps=100,
-    updates=5.0,
-)
-# The hand starts high above the object: with one control step per action, imagination does not look that far ahead.
-_META_WORLD = Setup(
-    policies=_MOSTLY_SCRIPTED,
-    acting=_ACTING,
-    options={"horizon": 60, "action_repeat": 4},
-    small={"image_size": 32, "mask_scale": 5},
-    episode_steps=60,
-    updates=5.0,
-)
-SETUPS = {
-    "reacher": Setup(policies=_BOTH, options={"horizon": 100}, episode_steps=150),
-    "cube_move": _CUBE,
-    "cube_lift": _CUBE,
-    "shelf_place": _META_WORLD,
-    "pick_place": _META_WORLD,
-}
-_TINY = {"image_size": 16, "horizon": 20}
-BUDGETS = {
-    "debug": Budget(steps=80, updates=4, goals=4, small=True, options=_TINY, episode_steps=3),
-    "cpu": Budget(steps=50_000, updates=1_500, small=True),
-    "small": Budget(steps=200_000, updates=20_000),
-    "paper": Budget(steps=1_000_000, updates=250_000),
-    "large": Budget(steps=1_000_000, updates=250_000),
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Result:
-    """What a row of a figure is, in one environment and with one seed."""
-
-    row: Row
-    env: str
-    evaluated: Evaluated
-
-
-def results(wanted: Evidence) -> list[Result]:
-    """All that a figure needs, seed by seed, so that a whole one is there early.
-
-    Raises:
-        SettingsError: for a size or an environment whose steps and updates are not known, or an agent that the figure
-            does not have.
-    """
-    rows = _rows(wanted)
-    return [
-        Result(row=row, env=env, evaluated=_evaluated(row, env, seed, wanted))
-        for seed in range(wanted.seeds)
-        for env in wanted.environments
-        for row in rows
-    ]
-
-
-def _rows(wanted: Evidence) -> list[Row]:
-    rows = FIGURES[wanted.figure].rows
-    known = dict.fromkeys(row.agent for row in rows)
-    if odd := [name for name in wanted.agents if name not in known]:
-        raise SettingsError(f"agents must be of those of figure={wanted.figure}, {', '.join(known)}; got {odd[0]!r}")
-    return [row for row in rows if row.agent in (wanted.agents or known)]
-
-
-def _evaluated(row: Row, env: str, seed: int, wanted: Evidence) -> Evaluated:
-    budget, setup = _known(BUDGETS, "size", wanted.size), _known(SETUPS, "env", env)
-    data = _data(row, env, wanted.steps or budget.steps, setup, budget, wanted.size)
-    updates = wanted.updates or round(budget.updates * setup.updates)
-    episode_steps = budget.episode_steps or setup.episode_steps
-    trained = Trained(
-        data=data,
-        agent=row.agent,
-        changes=row.changes,
-        size=wanted.size,
-        seed=seed,
-        updates=updates,
-        episode_steps=episode_steps,
-    )
-    return Evaluated(
-        trained=trained,
-        goals=wanted.goals or budget.goals,
-        episode_steps=episode_steps,
-        image_goals=row.image_goals,
-        random=row.random,
-    )
-
-
-def _data(row: Row, env: str, steps: int, setup: Setup, budget: Budget, size: str) -> Collected | Explored:
-    small = setup.small if budget.small else {}
-    options = {**setup.options, **small, **budget.options, **row.options}
-    if row.data in ("random", "scripted"):
-        return Collected(env=env, options=options, policies={row.data: steps})
-    if row.data:
-        return Explored(env=env, options=options, explorer=row.data, size=size, steps=steps)
-    if not setup.acting:
-        return Collected(env=env, options=options, policies=dict(_shared_out(steps, setup.policies)))
-    own = steps // 2
-    return Explored(
-        env=env,
-        options=options,
-        explorer=setup.acting,
-        size=size,
-        steps=steps,
-        policies=dict(_shared_out(steps - own, setup.policies)),
-        update_ratios=_LEARNING,
-        round_episodes=max(1, own // (_ROUNDS * all_options(env, options).horizon)),
-    )
-
-
-def _shared_out(steps: int, shares: Mapping[str, float]) -> Iterator[tuple[str, int]]:
-    done, until = 0, 0.0
-    for policy, share in shares.items():
-        until += share
-        yield policy, round(steps * until) - done
-        done = round(steps * until)
-
-
-def _known(table: Mapping[str, Any], setting: str, name: str) -> Any:
-    if name not in table:
-        raise SettingsError(f"{setting} must be one of {', '.join(table)}, whose figures are known, got {name!r}")
-    return table[name]
