@@ -22,7 +22,8 @@ BESIDE = {f"focus_pcp with {name}": {"behaviours.explore": explorer} for name, e
 SOURCES = {
     f"focus_lcp with goals from {name}": {"behaviours.reach.goals": name} for name in ("frames", "mixed", "future")
 }
-ROWS = {**{name: {} for name in AGENTS}, **BESIDE, **SOURCES}
+MOVING = {"behaviours.reach.goal.final_weight": 1, "behaviours.reach.reward.centred": True}
+ROWS = {**{name: {} for name in AGENTS}, **BESIDE, **SOURCES, "focus_lcp with what moves": MOVING}
 
 
 @pytest.fixture(params=ROWS)

@@ -39,7 +39,12 @@ def test_mixed_precision_works_on_a_cpu() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "changes"), [("dreamer", {}), ("dreamer_pcp", {}), ("focus_lcp", {"behaviours.reach.goals": "mixed"})]
+    ("name", "changes"),
+    [
+        ("dreamer", {}),
+        ("dreamer_pcp", {}),
+        ("focus_lcp", {"behaviours.reach.goals": "mixed", "behaviours.reach.goal.final_weight": 1.0}),
+    ],
 )
 @pytest.mark.usefixtures("no_noise")
 def test_update_compiles_into_one_graph(make_agent: Any, records: TensorDict, name: str, changes: dict) -> None:

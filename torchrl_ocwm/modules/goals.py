@@ -109,7 +109,7 @@ class FrameGoals(TensorDictModuleBase):
             # Those that are seen come first, in random order, and then again until there is one for each element.
             places = torch.arange(visible.numel(), device=goals.device) % seen
             index = (order + ~visible).argsort()[places]
-        return tensordict.set(self.goal_key, goals.flatten(0, -2)[index].reshape(goals.shape))
+        return tensordict.set(self.goal_key, goals.reshape(-1, goals.shape[-1])[index].reshape(goals.shape))
 
 
 class MixedGoals(TensorDictModuleBase):

@@ -150,11 +150,12 @@ class ImageDecoder(DreamerV3ImageDecoder):
     def forward(self, *inputs: Tensor) -> Tensor:
         """Images ``[..., C, H, W]`` of latents."""
         latent = torch.cat(inputs, -1)
-        hidden = self.projection(latent.flatten(0, -2)).unflatten(-1, self.initial_shape)
+        hidden = self.projection(latent.reshape(-1, latent.shape[-1])).unflatten(-1, self.initial_shape)
         hidden = self.layers[:-1](self.projection_norm(hidden))  # with its SiLU
         image = upsample(hidden, self.layers[-1], shift=0.5)
         # The encoder's stages begin at the first pixel too, so that a pixel is decoded from where it was encoded.
-        return image[..., : self.size[0], : self.size[1]].unflatten(0, latent.shape[:-1])
+        image = image[..., : self.size[0], : self.size[1]]
+        return image.reshape(*latent.shape[:-1], *image.shape[1:])
 
 
 class _ScaledImage(nn.Module):

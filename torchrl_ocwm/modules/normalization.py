@@ -114,7 +114,7 @@ class MovingCentre(_Moving):
     @torch.no_grad()
     def update(self, vectors: Tensor) -> None:
         """Take vectors ``[..., L]`` into the mean."""
-        self.mean.lerp_(vectors.float().flatten(0, -2).mean(0), self._count())
+        self.mean.lerp_(vectors.float().reshape(-1, vectors.shape[-1]).mean(0), self._count())
 
     def forward(self, vectors: Tensor) -> Tensor:
         """Vectors ``[..., L]`` without the mean; in training mode they are counted first."""
