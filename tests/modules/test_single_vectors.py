@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torchrl_ocwm.modules import Architecture, MovingCentre, ObjectDecoder, FrameGoals
+from torchrl_ocwm.modules import Architecture, FrameGoals, MovingCentre, ObjectDecoder
 from torchrl_ocwm.modules.networks import make_image_decoder, make_mlp
 from torchrl_ocwm.modules.rms_norm import RMSNorm
 

@@ -110,7 +110,7 @@ def _scale(x: Tensor, eps: Tensor) -> Tensor:
 
 def _gradients(gradient: Tensor, unit: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """From the gradient of y = u w with u = x r: w · g u ``[..., 1]``, and that of w ``[C]``."""
-    rows = (gradient * unit).reshape(-1, unit.shape[-1])
+    rows = torch.atleast_2d(gradient * unit).flatten(0, -2)
     return (rows @ weight).view(*unit.shape[:-1], 1), rows.sum(0)
 
 
