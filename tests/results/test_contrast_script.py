@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import runpy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from reading import RESULTS
 
-from torchrl_ocwm.evidence import Evidence, results
+from torchrl_ocwm.evidence import Evidence, Record, results
 
 
 def test_rows_that_are_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     main = runpy.run_path(str(RESULTS / "reacher/goal_latents/contrast.py"))["main"]
     plan = {one.row.name: one.evaluated.trained for one in results(Evidence(figure="goal_latents", seeds=1))}
     light = plan["focus_lcp, weight 1"]
-    file = tmp_path / light.name / "checkpoint.zip"
-    file.parent.mkdir(parents=True)
-    file.touch()
+    for run, done in ((light, True), (plan["focus_lcp, centred latents"], False)):
+        replace(Record.of(run, tmp_path), done=done).write(tmp_path / run.name)
+        (tmp_path / run.name / "checkpoint.zip").touch()
     seen = []
 
     def diagnose(name: str, data: Path, output: Path) -> dict[str, Any]:
@@ -32,7 +33,7 @@ def test_rows_that_are_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap
     data = tmp_path / light.data.name / "data"
     assert seen == [
         ("reacher/focus_lcp", data, tmp_path / "new" / plan["focus_lcp"].name),  # the one that comes with the package
-        (str(file), data, tmp_path / "new" / light.name),
+        (str(tmp_path / light.name / "checkpoint.zip"), data, tmp_path / "new" / light.name),
     ]
     _, _, first, second = capsys.readouterr().out.splitlines()
     assert first == "| focus_lcp | 1.000 | 1.125 | 1.250 | 1.375 | 1500.000 |"

@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 from torchrl_ocwm.agents import shipped_agents
-from torchrl_ocwm.evidence import Evidence, Result, results
+from torchrl_ocwm.evidence import Evidence, Record, Result, results
 
 COLUMNS = {
     "cosine": "cosine",
@@ -27,9 +27,12 @@ COLUMNS = {
 
 
 def checkpoint(one: Result, evidence: Path) -> str | None:
-    """Where the agent of a row is."""
-    file, shipped = evidence / one.evaluated.trained.name / "checkpoint.zip", f"{one.env}/{one.row.name}"
-    return str(file) if file.exists() else shipped if shipped in shipped_agents() else None
+    """Where the trained agent of a row is."""
+    run, shipped = one.evaluated.trained, f"{one.env}/{one.row.name}"
+    file = evidence / run.name / "checkpoint.zip"
+    if file.exists() and Record.of(run, evidence).done:
+        return str(file)
+    return shipped if shipped in shipped_agents() else None
 
 
 def diagnose(name: str, data: Path, output: Path) -> dict[str, float]:
