@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_ocwm.evidence import Evidence, in_order, results
 from torchrl_ocwm.evidence.earlier import RUNS
 from torchrl_ocwm.evidence.estimate import in_words
 
@@ -28,3 +29,13 @@ def test_records_are_those_of_the_page(page: Path) -> None:
     results = json.loads((page.parent / "reacher" / "results.json").read_text(encoding="utf-8"))
     evaluated = {run for row in results["agents"].values() for run in row["runs"] if run.startswith("evaluations/")}
     assert evaluated == {name for name in records if name.startswith("evaluations/")}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
+def test_runs_are_those_of_the_command_today(page: Path) -> None:
+    """Their names are made of all settings that are no default: none of these has changed since."""
+    (command,) = re.findall(r"^ocwm reproduce (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    given = dict(setting.split("=") for setting in command.split())
+    wanted = Evidence(figure=given["figure"], env=given["env"], size=given["size"], seeds=int(given["seeds"]))
+    runs = in_order(one.evaluated for one in results(wanted))
+    assert {run.name for run in runs} == set(json.loads((page.parent / RUNS).read_text(encoding="utf-8")))
