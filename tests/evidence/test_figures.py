@@ -11,7 +11,18 @@ import pytest
 from torchrl_ocwm.agents import AGENTS, SIZES
 from torchrl_ocwm.console import COMMANDS
 from torchrl_ocwm.envs import ENVIRONMENTS
-from torchrl_ocwm.evidence import BUDGETS, FIGURES, SETUPS, Evaluated, Evidence, Machine, Run, in_order, results
+from torchrl_ocwm.evidence import (
+    BUDGETS,
+    FIGURES,
+    SETUPS,
+    Evaluated,
+    Evidence,
+    Machine,
+    Run,
+    Trained,
+    in_order,
+    results,
+)
 from torchrl_ocwm.settings import SettingsError, change, from_dict, to_dict
 
 ROOT = Path("/runs/it's a=b")
@@ -53,6 +64,20 @@ def test_what_a_figure_needs(figure: str, datasets: int, trainings: int, size: s
     more = runs(figure, size=size, seeds=3, env=("reacher", "cube_move"))
     trained = {"trainings": 6 * trainings, "evaluations": 6 * trainings}
     assert count(more) == {"datasets": 2 * datasets, **trained}  # all seeds learn from the same data
+
+
+@pytest.mark.parametrize(
+    ("env", "size", "updates"),
+    [
+        ("reacher", "cpu", 1_500),
+        ("cube_move", "cpu", 15_000),
+        ("reacher", "paper", 250_000),
+        ("cube_move", "paper", 250_000),
+    ],
+)
+def test_updates_that_an_environment_needs(env: str, size: str, updates: int) -> None:
+    """Ten times Reacher's where all is small; the paper has as many everywhere."""
+    assert {run.updates for run in runs("table", env=env, size=size) if isinstance(run, Trained)} == {updates}
 
 
 def test_what_is_needed_comes_first_and_a_whole_seed_before_the_next() -> None:

@@ -17,7 +17,7 @@ class Setup:
         options: Options of the environment.
         small: Further options at the sizes for a CPU.
         episode_steps: Steps of each evaluated episode.
-        updates: How many times as many updates as Reacher it needs.
+        updates: How many times as many updates as Reacher it needs at the sizes for a CPU.
     """
 
     policies: Mapping[str, float]
@@ -58,7 +58,7 @@ _CUBE = Setup(
     options={"horizon": 100},
     small={"image_size": 32, "mask_scale": 5},
     episode_steps=100,
-    updates=5.0,
+    updates=10.0,
 )
 # The hand starts high above the object: with one control step per action, imagination does not look that far ahead.
 _META_WORLD = Setup(
@@ -67,7 +67,7 @@ _META_WORLD = Setup(
     options={"horizon": 60, "action_repeat": 4},
     small={"image_size": 32, "mask_scale": 5},
     episode_steps=60,
-    updates=5.0,
+    updates=10.0,
 )
 SETUPS = {
     "reacher": Setup(policies=_BOTH, options={"horizon": 100}, episode_steps=150),
