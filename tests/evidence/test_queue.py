@@ -166,7 +166,7 @@ def need_ray(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["local", "ray"])
 def test_several_at_a_time(launcher: Literal["local", "ray"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Two that wait for ever are both at work."""
+    """Two that wait for ever are both at work; on a busy machine Ray takes its time to begin."""
     if launcher == "ray":
         need_ray(monkeypatch)
     runs = [Stub(title=title, what="wait") for title in ("one", "two", "three")]
@@ -177,7 +177,7 @@ def test_several_at_a_time(launcher: Literal["local", "ray"], monkeypatch: pytes
         pass
 
     def watch(*_: Any, **__: Any) -> Any:
-        assert wait_until(lambda: len(begun(tmp_path)) == 2)
+        assert wait_until(lambda: len(begun(tmp_path)) == 2, seconds=300)
         raise Enough
 
     monkeypatch.setattr("torchrl_ocwm.evidence.queue.wait", watch)
