@@ -10,7 +10,13 @@ from torch import nn
 
 from torchrl_ocwm.agents import SIZES, build_agent
 from torchrl_ocwm.modules import UnitRMS
-from torchrl_ocwm.objectives import FOCUSModelLoss, mask_nll, object_reconstruction, positional_latent_loss
+from torchrl_ocwm.objectives import (
+    AnnealedWeight,
+    FOCUSModelLoss,
+    mask_nll,
+    object_reconstruction,
+    positional_latent_loss,
+)
 from torchrl_ocwm.objectives.world_model import visible_position_reconstruction
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import STYLES, reacher_task
@@ -252,6 +258,12 @@ def test_the_distance_reaches_what_encodes_goals(make_agent: Any, records: Tenso
     ):
         expected = positional_latent_loss(goal, latent, visible, distance=distance)
         torch.testing.assert_close(losses[f"loss_model_{name}"], expected)
+
+
+@pytest.mark.parametrize("settings", [(0.0, 1.0, 3), (1.0, 0.0, 3), (1.0, 2.0, 0)])
+def test_a_weight_that_cannot_move(settings: tuple[float, float, int]) -> None:
+    with pytest.raises(ValueError, match="moves between values above 0"):
+        AnnealedWeight(*settings)
 
 
 def test_an_annealed_weight_by_hand(make_agent: Any, records: TensorDict) -> None:

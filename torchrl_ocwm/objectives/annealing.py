@@ -18,6 +18,9 @@ class AnnealedWeight(nn.Module):
 
     Called without arguments; returns a float32 scalar.
 
+    Raises:
+        ValueError: for a value that is not above 0, or no update.
+
     Examples:
         >>> weight = AnnealedWeight(100.0, 1.0, 2)
         >>> [round(weight().item()) for _ in range(4)]
@@ -28,6 +31,8 @@ class AnnealedWeight(nn.Module):
 
     def __init__(self, first: float, last: float, updates: int) -> None:
         super().__init__()
+        if min(first, last, updates) <= 0:
+            raise ValueError(f"a weight moves between values above 0 in updates, got {first} to {last} in {updates}")
         self.first, self.ratio, self.updates = first, last / first, updates
         self.register_buffer("done", torch.zeros(()))
 
