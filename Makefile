@@ -26,7 +26,8 @@ LONG := \
 	tests/evaluation/test_episodes.py::test_process_that_dies_or_hangs_ends_the_evaluation[19] \
 	tests/data/test_collect.py::test_process_that_dies_or_hangs_is_replaced[19] \
 	tests/training/test_online.py::test_the_recipe_goes_on_after_a_signal[Ctrl-C] \
-	tests/examples/test_benchmarks.py::test_speed_of_an_evaluation_adds_up
+	tests/examples/test_benchmarks.py::test_speed_of_an_evaluation_adds_up \
+	tests/evidence/test_queue.py::test_several_at_a_time[ray]
 # Other Pythons, of which the machine may have some (`python3.10`, or in pyenv): the package and its recipes, no simulator.
 PYTHONS := 3.10 3.13
 # GB that must be free for one of them: it comes with CUDA, 5 GB. It goes when its tests have passed.
