@@ -52,7 +52,7 @@ def _rows(wanted: Evidence) -> list[Row]:
 def _evaluated(row: Row, env: str, seed: int, wanted: Evidence) -> Evaluated:
     budget, setup = _known(BUDGETS, "size", wanted.size), _known(SETUPS, "env", env)
     data = _data(row, env, wanted.steps or budget.steps, setup, budget, wanted.size)
-    updates = wanted.updates or round(budget.updates * (setup.updates if budget.small else 1))
+    updates = wanted.updates or min(round(budget.updates * setup.updates), BUDGETS["paper"].updates)
     episode_steps = budget.episode_steps or setup.episode_steps
     trained = Trained(
         data=data,

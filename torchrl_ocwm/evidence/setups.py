@@ -17,7 +17,7 @@ class Setup:
         options: Options of the environment.
         small: Further options at the sizes for a CPU.
         episode_steps: Steps of each evaluated episode.
-        updates: How many times as many updates as Reacher it needs at the sizes for a CPU.
+        updates: How many times as many updates as Reacher it needs; the paper's number is the most that it gets.
     """
 
     policies: Mapping[str, float]
