@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 from collections.abc import Callable, Mapping
@@ -85,7 +86,7 @@ class OnRay(Launcher):
         self._ray, self.failures = ray, (ray.exceptions.RayError, UserError)
         self._ours = not ray.is_initialized()
         if self._ours:
-            ray.init(log_to_driver=False, logging_level="warning", ignore_reinit_error=True)
+            ray.init(log_to_driver=False, logging_level=logging.WARNING, ignore_reinit_error=True)
         gpus = 1 if how.device == "cuda" else 0
         there = ray.cluster_resources()
         room = there.get("GPU", 0) if gpus else there.get("CPU", 1) // how.threads
