@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
+import stat
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -40,6 +44,15 @@ class Counter:
 
     def fail(self, odd: bool) -> None:
         raise OddError(3, "times") if odd else KeyError("there")
+
+    def die_slowly(self) -> None:
+        """Sockets first, as the system does it; on a busy machine the rest takes its time."""
+        for number in os.listdir("/proc/self/fd"):
+            with suppress(OSError):
+                if stat.S_ISSOCK(os.fstat(int(number)).st_mode):
+                    os.close(int(number))
+        time.sleep(3)
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.mark.parametrize("process", [False, True])
@@ -83,6 +96,16 @@ def test_requests_to_the_dead_do_not_raise() -> None:
     worker._process.kill()
     worker._process.join()
     worker.request("add", 1)
+    with pytest.raises(WorkerError, match=r"has ended \(signal SIGKILL\)"):
+        worker.answer()
+    worker.close()
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/fd"), reason="needs the list of a process's open files")
+def test_how_a_process_ends_is_waited_for() -> None:
+    worker = make_worker(Counter, process=True, timeout=60)
+    worker.ready()
+    worker.request("die_slowly")
     with pytest.raises(WorkerError, match=r"has ended \(signal SIGKILL\)"):
         worker.answer()
     worker.close()

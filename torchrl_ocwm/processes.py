@@ -23,6 +23,7 @@ from torchrl_ocwm.errors import UserError
 #: Makes the object, given a function to call now and then while it works: a sign of life.
 Make = Callable[[Callable[[], None]], Any]
 _START = 120.0  # seconds: a process has to import PyTorch and to load a simulator
+_END = 30.0  # seconds from the end of its socket to that of a process, on a busy machine
 _SIGN = None
 
 
@@ -173,7 +174,7 @@ class ProcessWorker:
                 f"process {self._process.pid} has given no sign of life for {self._socket.gettimeout():g} seconds"
             ) from None
         except (EOFError, OSError, pickle.UnpicklingError):
-            self._process.join(1)
+            self._process.join(_END)
             raise WorkerError(f"process {self._process.pid} has ended ({_how(self._process.exitcode)})") from None
 
     def close(self) -> None:
