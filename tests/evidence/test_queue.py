@@ -18,7 +18,7 @@ import torch
 
 from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.evidence import LAUNCHERS, Machine, Record, Run, RunFailedError, in_order, launchers, queue, work_off
-from torchrl_ocwm.evidence.runs import Command
+from torchrl_ocwm.evidence.command_line import Command
 
 #: Says that it has begun, in the order of all, and then does what its name says.
 SCRIPT = """

@@ -11,7 +11,7 @@ import pytest
 
 from torchrl_ocwm.agents import AGENTS, SIZES
 from torchrl_ocwm.evidence import Collected, Evaluated, Explored, Record, RecordError, Trained
-from torchrl_ocwm.evidence.runs import essential
+from torchrl_ocwm.evidence.content import essential
 from torchrl_ocwm.settings import Settings, change, to_dict
 from torchrl_ocwm.testing import random_dataset, reacher_task
 

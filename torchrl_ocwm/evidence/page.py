@@ -11,13 +11,14 @@ from torchrl_ocwm.envs import make_task
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evaluation.plots import heatmap, learning_curves, metric_lines, read_scalar
 from torchrl_ocwm.evaluation.report import COLUMNS, Report, ReportError
+from torchrl_ocwm.evidence.command_line import written
 from torchrl_ocwm.evidence.earlier import CURVES, IMAGE_GOALS, METRIC, RANDOM, random_run, save_records
 from torchrl_ocwm.evidence.estimate import in_words
 from torchrl_ocwm.evidence.figures import FIGURES, Figure
 from torchrl_ocwm.evidence.plan import Result
 from torchrl_ocwm.evidence.queue import in_order
 from torchrl_ocwm.evidence.records import Record
-from torchrl_ocwm.evidence.runs import Run, written
+from torchrl_ocwm.evidence.runs import Run
 from torchrl_ocwm.evidence.settings import Evidence
 
 CURVE = {METRIC: "final score, landmark goals"}

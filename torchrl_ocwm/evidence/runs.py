@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -13,13 +13,12 @@ from typing import Any, ClassVar
 
 from torchrl_ocwm.agents import AGENTS, SIZES
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
-from torchrl_ocwm.envs import find_environment
+from torchrl_ocwm.evidence.command_line import Command, given, override, written
+from torchrl_ocwm.evidence.content import all_options, essential, image_size
 from torchrl_ocwm.evidence.settings import Machine
-from torchrl_ocwm.settings import Settings, change, from_dict
+from torchrl_ocwm.settings import change
 from torchrl_ocwm.training import CHECKPOINT, Online, Training
 
-#: What follows ``ocwm`` on a command line.
-Command = tuple[str, ...]
 #: Episodes of each evaluation during training, to as many of the landmark goals.
 LANDMARKS = 5
 #: Evaluations during training.
@@ -405,75 +404,6 @@ class Evaluated(Run):
     def reached(self, root: Path) -> int:
         """All or nothing: an evaluation begins anew."""
         return self.work if (root / self.name / "results.json").exists() else 0
-
-
-def essential(content: Any) -> Any:
-    """Settings without those that have their default.
-
-    So a setting that is added later, with what was the rule before as its default, changes no name.
-
-    Examples:
-        >>> essential({"training": Training(seed=3), "env": "reacher"})
-        {'training': {'seed': 3}, 'env': 'reacher'}
-    """
-    if isinstance(content, Mapping):
-        return {name: essential(value) for name, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [essential(value) for value in content]
-    if not is_dataclass(content):
-        return content
-    known = content.name_and_kind() if isinstance(content, Settings) else None
-    name: dict[str, Any] = {} if known is None else {"name": known[0]}
-    values = {one.name: getattr(content, one.name) for one in fields(content) if not _is_default(content, one)}
-    return {**name, **{name: essential(value) for name, value in values.items()}}
-
-
-def _is_default(settings: Any, one: Any) -> bool:
-    default = one.default if one.default_factory is MISSING else one.default_factory()
-    return bool(getattr(settings, one.name) == default)
-
-
-def all_options(env: str, options: Mapping[str, Any]) -> Any:
-    """The options of an environment as its settings class, which has the defaults of the others."""
-    return from_dict(find_environment(env).options, options, "options")
-
-
-def image_size(env: str, options: Mapping[str, Any]) -> int:
-    """Pixels on a side; an environment of a plugin may have another name for it, and then it is 0."""
-    return getattr(all_options(env, options), "image_size", 0)
-
-
-def given(at: str, values: Mapping[str, Any]) -> list[str]:
-    """Settings below a name, as a command line has them.
-
-    Examples:
-        >>> given("agent.world_model", {"lambda_proprio": 2.0, "observed": ["proprio"]})
-        ['agent.world_model.lambda_proprio=2.0', 'agent.world_model.observed=[proprio]']
-    """
-    return [f"{at}.{name}={written(value)}" for name, value in values.items()]
-
-
-def written(value: Any) -> str:
-    """A value as a command line has it.
-
-    Examples:
-        >>> written(True), written(None), written(("a", 1))
-        ('true', 'null', '[a,1]')
-    """
-    if isinstance(value, (list, tuple)):
-        return f"[{','.join(map(written, value))}]"
-    return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))
-
-
-def override(name: str, path: Path) -> str:
-    r"""A path as a command line has it, whatever letters are in it.
-
-    Examples:
-        >>> print(override("output", Path("what's/a=b")))
-        output='what\'s/a=b'
-    """
-    text = str(path).replace("'", "\\'")
-    return f"{name}='{text}'"
 
 
 def steps_in(path: Path) -> int:
