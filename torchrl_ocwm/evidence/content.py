@@ -16,6 +16,7 @@ def essential(content: Any) -> Any:
     So a setting that is added later, with what was the rule before as its default, changes no name.
 
     Examples:
+        >>> from torchrl_ocwm.training import Training
         >>> essential({"training": Training(seed=3), "env": "reacher"})
         {'training': {'seed': 3}, 'env': 'reacher'}
     """
