@@ -7,10 +7,12 @@ import re
 from pathlib import Path
 
 import pytest
+import yaml
 
 from torchrl_ocwm.evidence import Evidence, in_order, results
 from torchrl_ocwm.evidence.earlier import RUNS
 from torchrl_ocwm.evidence.estimate import in_words
+from torchrl_ocwm.settings import from_dict
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "results" / "figures").glob("*/README.md"))
 
@@ -26,8 +28,10 @@ def test_records_are_those_of_the_page(page: Path) -> None:
         record = records[name]
         assert (record["done"], record["commit"], in_words(record["seconds"])) == (True, commit, wall)
         assert record["machine"] in text
-    results = json.loads((page.parent / "reacher" / "results.json").read_text(encoding="utf-8"))
-    evaluated = {run for row in results["agents"].values() for run in row["runs"] if run.startswith("evaluations/")}
+    evaluated = set()
+    for file in page.parent.glob("*/results.json"):
+        rows = json.loads(file.read_text(encoding="utf-8"))["agents"].values()
+        evaluated |= {run for row in rows for run in row["runs"] if run.startswith("evaluations/")}
     assert evaluated == {name for name in records if name.startswith("evaluations/")}
 
 
@@ -35,7 +39,7 @@ def test_records_are_those_of_the_page(page: Path) -> None:
 def test_runs_are_those_of_the_command_today(page: Path) -> None:
     """Their names are made of all settings that are no default: none of these has changed since."""
     (command,) = re.findall(r"^ocwm reproduce (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    given = dict(setting.split("=") for setting in command.split())
-    wanted = Evidence(figure=given["figure"], env=given["env"], size=given["size"], seeds=int(given["seeds"]))
+    given = {name: yaml.safe_load(value) for name, value in (setting.split("=") for setting in command.split())}
+    wanted = from_dict(Evidence, given)
     runs = in_order(one.evaluated for one in results(wanted))
     assert {run.name for run in runs} == set(json.loads((page.parent / RUNS).read_text(encoding="utf-8")))
