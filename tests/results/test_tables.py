@@ -39,10 +39,19 @@ def test_the_stronger_baselines_in_the_readme() -> None:
 
 def test_cube_move_on_the_same_data_in_the_readme() -> None:
     found = report("figures/table-cube_move-cpu/cube_move")
-    rows = "dreamer, weights 1", "dreamer, weights 200", "focus_pcp", "focus_lcp", "focus_lcp, image goals", "random"
+    rows = (
+        "dreamer, weights 1",
+        "dreamer, weights 200",
+        "dreamer_pcp",
+        "focus_pcp",
+        "focus_lcp",
+        "focus_lcp, image goals",
+        "random",
+    )
     light, heavy, *others = (cell(found, name, "final_score") for name in rows)
-    pcp, lcp, images, random = others
+    dreamer_pcp, pcp, lcp, images, random = others
     assert len(found.goals) == 100
     text = " ".join((ROOT / "README.md").read_text().split())
-    assert f"`dreamer` scores {light} with weights of 1 and {heavy} with 200, `focus_pcp` {pcp}, " in text
+    assert f"`dreamer` scores {light} with weights of 1 and {heavy} with 200, " in text
+    assert f"`dreamer_pcp` {dreamer_pcp}, `focus_pcp` {pcp}, " in text
     assert f"`focus_lcp` {lcp}, with images {images}, random actions {random} ([one seed]" in text
