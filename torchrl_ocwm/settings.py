@@ -156,8 +156,12 @@ def from_dict(kind: type[T], values: Any, at: str = "") -> T:
         raise SettingsError(f"{where}{error}") from None
 
 
-def to_dict(settings: Any) -> Any:
+def to_dict(settings: Any, *, defaults: bool = True) -> Any:
     """Settings as a mapping that fits in JSON and YAML; a registered part has its name in it.
+
+    Args:
+        settings: Of any kind, or mappings and lists of them.
+        defaults: Whether those that have their default are in it.
 
     Examples:
         >>> from torchrl_ocwm.agents import AGENTS
@@ -165,14 +169,20 @@ def to_dict(settings: Any) -> Any:
         {'name': 'position_distance', 'unit': 'metre'}
     """
     if isinstance(settings, Mapping):
-        return {name: to_dict(value) for name, value in settings.items()}
+        return {name: to_dict(value, defaults=defaults) for name, value in settings.items()}
     if isinstance(settings, (list, tuple)):
-        return [to_dict(value) for value in settings]
+        return [to_dict(value, defaults=defaults) for value in settings]
     if not is_dataclass(settings):
         return settings
     known = settings.name_and_kind() if isinstance(settings, Settings) else None
     name: dict[str, Any] = {} if known is None else {"name": known[0]}
-    return {**name, **{one.name: to_dict(getattr(settings, one.name)) for one in fields(settings)}}
+    given = [one for one in fields(settings) if defaults or not _is_default(settings, one)]
+    return {**name, **{one.name: to_dict(getattr(settings, one.name), defaults=defaults) for one in given}}
+
+
+def _is_default(settings: Any, one: Field) -> bool:
+    default = one.default if one.default_factory is MISSING else one.default_factory()
+    return bool(getattr(settings, one.name) == default)
 
 
 def flat(values: Mapping[str, Any], at: str = "") -> dict[str, Any]:

@@ -11,7 +11,6 @@ import pytest
 
 from torchrl_ocwm.agents import AGENTS, SIZES
 from torchrl_ocwm.evidence import Collected, Evaluated, Explored, Record, RecordError, Trained
-from torchrl_ocwm.evidence.content import essential
 from torchrl_ocwm.settings import Settings, change, to_dict
 from torchrl_ocwm.testing import random_dataset, reacher_task
 
@@ -94,8 +93,12 @@ def test_a_new_setting_with_its_default_changes_no_name() -> None:
     class After(Before):
         three: tuple[int, ...] = (3,)
 
-    assert essential({"a": Before(two=5)}) == essential({"a": After(two=5)}) == {"a": {"two": 5}}
-    assert essential(After(three=(4,))) == {"three": [4]}
+    assert (
+        to_dict({"a": Before(two=5)}, defaults=False)
+        == to_dict({"a": After(two=5)}, defaults=False)
+        == {"a": {"two": 5}}
+    )
+    assert to_dict(After(three=(4,)), defaults=False) == {"three": [4]}
 
 
 def test_a_default_that_has_changed_is_noticed(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from torchrl_ocwm.evidence.content import all_options
 from torchrl_ocwm.evidence.figures import FIGURES, Row
+from torchrl_ocwm.evidence.options import all_options
 from torchrl_ocwm.evidence.runs import Collected, Evaluated, Explored, Trained
 from torchrl_ocwm.evidence.settings import Evidence
 from torchrl_ocwm.evidence.setups import BUDGETS, SETUPS, Budget, Setup

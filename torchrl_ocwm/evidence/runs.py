@@ -14,9 +14,9 @@ from typing import Any, ClassVar
 from torchrl_ocwm.agents import AGENTS, SIZES
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.evidence.command_line import Command, given, override, written
-from torchrl_ocwm.evidence.content import all_options, essential, image_size
+from torchrl_ocwm.evidence.options import all_options, image_size
 from torchrl_ocwm.evidence.settings import Machine
-from torchrl_ocwm.settings import change
+from torchrl_ocwm.settings import change, to_dict
 from torchrl_ocwm.training import CHECKPOINT, Online, Training
 
 #: Episodes of each evaluation during training, to as many of the landmark goals.
@@ -71,8 +71,12 @@ class Run(ABC):
 
     @cached_property
     def name(self) -> str:
-        """Its folder in that of all runs; runs of the same name are the same."""
-        text = json.dumps(essential(self.content), sort_keys=True)
+        """Its folder in that of all runs; runs of the same name are the same.
+
+        Settings with their default are no part of it: one that is added later, with what was the rule before as its
+        default, changes no name.
+        """
+        text = json.dumps(to_dict(self.content, defaults=False), sort_keys=True)
         return f"{self.kind}/{self.prefix}-{sha256(text.encode()).hexdigest()[:8]}"
 
 
