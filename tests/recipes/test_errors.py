@@ -18,7 +18,8 @@ from torchrl_ocwm.envs import Task, registry
 from torchrl_ocwm.envs.calibration import CalibrationError
 from torchrl_ocwm.envs.missing import SystemLibraryError
 from torchrl_ocwm.envs.opengl import RenderingError
-from torchrl_ocwm.envs.positioning import NoScriptedPolicyError, SimulationDivergedError
+from torchrl_ocwm.envs.physics import SimulationDivergedError
+from torchrl_ocwm.envs.positioning import NoScriptedPolicyError
 from torchrl_ocwm.errors import MissingPackageError, UserError
 from torchrl_ocwm.evaluation.output import OutputError
 from torchrl_ocwm.evaluation.report import ReportError

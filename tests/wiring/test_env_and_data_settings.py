@@ -19,7 +19,7 @@ import torchrl_ocwm.envs
 from torchrl_ocwm.data import Collection, collect
 from torchrl_ocwm.data.dataset import EpisodeDataset
 from torchrl_ocwm.envs import ENVIRONMENTS, PositioningEnv, make_env, make_task
-from torchrl_ocwm.envs.positioning import TARGET_COLOUR
+from torchrl_ocwm.envs.virtual_target import TARGET_COLOUR
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import reacher_task
 

@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from torchrl_ocwm.envs.cube_move import CubeMove
     from torchrl_ocwm.envs.goal_conditioned import GoalConditioned
     from torchrl_ocwm.envs.meta_world import PickPlace, ShelfPlace
-    from torchrl_ocwm.envs.positioning import PositioningEnv, SimulationDivergedError
+    from torchrl_ocwm.envs.physics import SimulationDivergedError
+    from torchrl_ocwm.envs.positioning import PositioningEnv
     from torchrl_ocwm.envs.reacher import Reacher
 
 __all__ = [
@@ -98,6 +99,6 @@ __getattr__ = lazily(
         "PositioningEnv": "positioning",
         "Reacher": "reacher",
         "ShelfPlace": "meta_world",
-        "SimulationDivergedError": "positioning",
+        "SimulationDivergedError": "physics",
     },
 )

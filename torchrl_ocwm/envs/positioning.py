@@ -14,8 +14,11 @@ import torch
 from torchrl_ocwm.envs.camera import Camera, Frame
 from torchrl_ocwm.envs.colour_masks import ColourMasks
 from torchrl_ocwm.envs.missing import needs
+from torchrl_ocwm.envs.physics import check_physics
 from torchrl_ocwm.envs.positions import masks_to_positions
+from torchrl_ocwm.envs.projection import project, unproject
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
+from torchrl_ocwm.envs.virtual_target import draw_target
 from torchrl_ocwm.envs.workspace import Workspace
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.images import ImageSize, image_shape
@@ -25,15 +28,8 @@ with needs("an environment", "dm-control"):
     import mujoco
     from gymnasium import spaces
 
-TARGET_COLOUR = (230, 40, 40)
-_FARTHEST = 100  # times the size of the model; nothing gets there but by a jump
-
 Observation = dict[str, np.ndarray]
 _Seen = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # pixels, masks, positions, which objects are visible
-
-
-class SimulationDivergedError(UserError, RuntimeError):
-    """The physics of an episode broke down, and what it showed since means nothing. A reset starts a new one."""
 
 
 class NoScriptedPolicyError(UserError, NotImplementedError):
@@ -391,7 +387,7 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         return spaces.Dict(keys)
 
     def _observe(self, data: mujoco.MjData, goal: np.ndarray | None = None) -> Observation:
-        self._check_physics(data)
+        check_physics(self.model, data)
         goal = self._goal if goal is None else goal
         pixels, masks, estimate, seen = self._nothing() if self.blind else self._look(data, goal)
         observation = {
@@ -417,8 +413,10 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
             depth=None if frame.depth is None else torch.from_numpy(frame.depth[None] + self.depth_offset),
             plane=self._plane,
         )
-        pixels = self._paint_target(frame.pixels, masks.any(0), goal, data).transpose(2, 0, 1)
-        return pixels, masks.copy(), self._relative(world.numpy()), visible.numpy()
+        pixels = frame.pixels
+        if self.virtual_target:
+            draw_target(pixels, self._project(goal, data), self.virtual_target, behind=masks.any(0))
+        return pixels.transpose(2, 0, 1), masks.copy(), self._relative(world.numpy()), visible.numpy()
 
     def _segment(self, frame: Frame, data: mujoco.MjData) -> np.ndarray:
         """Masks (O, S * H, S * W), by colour if colours were learnt."""
@@ -446,16 +444,6 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         hidden = np.zeros((objects, *shape), bool), np.zeros_like(self._last_seen), np.zeros(objects, bool)
         return np.zeros((3, *shape), np.uint8), *hidden
 
-    def _check_physics(self, data: mujoco.MjData) -> None:
-        """MuJoCo goes on after a warning, with a state that is reset or contacts that are missing."""
-        if data.warning.number.any():
-            for kind, warning in zip(mujoco.mjtWarning.__members__, data.warning, strict=False):
-                if warning.number and kind != "mjWARN_VGEOMFULL":  # the camera's own
-                    raise SimulationDivergedError(f"MuJoCo's simulation broke down ({kind} at {warning.lastinfo})")
-        farthest = np.abs(data.xpos).max()
-        if not farthest < _FARTHEST * self.model.stat.extent:
-            raise SimulationDivergedError(f"MuJoCo's simulation broke down (a body is {farthest:.3g} m away)")
-
     def true_position(self) -> np.ndarray:
         """Where the objects are, (O, D) float32 metres from the start position: the simulator's own value."""
         return self._relative(self._true_position(self.data))
@@ -465,18 +453,6 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def _distance(self, observation: Observation) -> float:
         return math.dist(observation["object_position"][0], observation["goal_position"])
-
-    def _paint_target(
-        self, pixels: np.ndarray, objects: np.ndarray, goal: np.ndarray, data: mujoco.MjData
-    ) -> np.ndarray:
-        if not self.virtual_target:
-            return pixels
-        column, row = self._project(goal, data)
-        centres = np.arange(self.image_size) + 0.5
-        distance = np.hypot(centres[None] - column, centres[:, None] - row)
-        disc = (distance <= self.virtual_target / 2) | (distance == distance.min())
-        pixels[disc & ~objects] = TARGET_COLOUR
-        return pixels
 
     def project(self, position: np.ndarray) -> np.ndarray:
         """Where a position (..., D), metres from the start, appears in the image: (..., 2) as (column, row)."""
@@ -496,25 +472,16 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
             ValueError: for a point where the camera does not see the plane.
         """
         self._check_open()
-        pose, point = self.camera.extrinsics(self.data).astype(np.float64), np.asarray(point, np.float64)
-        pixels = np.concatenate([point, np.ones((*point.shape[:-1], 1))], -1)
-        rays = pixels @ np.linalg.inv(self._intrinsics.numpy().astype(np.float64)).T @ pose[:3, :3].T
         across = 2 if len(self._axes) == 3 else ({0, 1, 2} - set(self._axes)).pop()
-        level = self._start[across] + (height if len(self._axes) == 3 else 0.0) - pose[across, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            far = level / rays[..., across]
-        if not (np.isfinite(far) & (far > 0)).all():
-            raise ValueError(f"the camera does not see the plane of the goals at {point.tolist()} (column, row)")
-        world = pose[:3, 3] + far[..., None] * rays
+        level = self._start[across] + (height if len(self._axes) == 3 else 0.0)
+        pose, intrinsics = self.camera.extrinsics(self.data), self._intrinsics.numpy()
+        world = unproject(np.asarray(point), intrinsics, pose, across, level)
         return (world - self._start)[..., self._axes].astype(np.float32)
 
     def _project(self, position: np.ndarray, data: mujoco.MjData) -> np.ndarray:
         world = np.broadcast_to(self._start, (*position.shape[:-1], 3)).copy()
         world[..., self._axes] += position
-        pose = self.camera.extrinsics(data)
-        in_camera = (world - pose[:3, 3]) @ pose[:3, :3]
-        in_image = in_camera @ self._intrinsics.numpy().T
-        return in_image[..., :2] / in_image[..., 2:]
+        return project(world, self._intrinsics.numpy(), self.camera.extrinsics(data))
 
 
 def _any_of(geoms: np.ndarray, ids: list[int]) -> np.ndarray:
