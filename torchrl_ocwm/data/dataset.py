@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-import stat
 import warnings
-import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from math import prod
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from tensordict import TensorDictBase
 
 from torchrl_ocwm.data.contract import DatasetError, check_values, conform
+from torchrl_ocwm.data.frames import FRAMES, FrameFiles, stored_frames
 from torchrl_ocwm.data.index import (
-    DTYPES,
     FORMAT,
     INDEX,
     VERSION,
@@ -30,11 +26,9 @@ from torchrl_ocwm.data.index import (
     read_index,
     to_json,
 )
-from torchrl_ocwm.data.memory import map_privately, release_pages
+from torchrl_ocwm.data.memory import release_pages
 from torchrl_ocwm.envs.task import Task
-from torchrl_ocwm.files import only_writer, replacing, sync
-
-_FRAMES = "frames"
+from torchrl_ocwm.files import only_writer, replacing
 
 
 class EpisodeDataset:
@@ -54,6 +48,7 @@ class EpisodeDataset:
 
     Examples:
         >>> import tempfile
+        >>> from tensordict import TensorDict
         >>> records = TensorDict({"action": torch.zeros(3, 2), "is_init": torch.tensor([[True], [False], [False]]),
         ...     "next": {"observation": torch.rand(3, 4)}}, [3])
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -106,7 +101,7 @@ class EpisodeDataset:
             try:
                 refuse_another(path)  # which was made meanwhile
                 dataset._commit(dataset._index)
-                dataset._make_files()
+                dataset._files.make()
             except BaseException:
                 dataset.close()
                 raise
@@ -132,7 +127,7 @@ class EpisodeDataset:
                 dataset._prepare_writing()
             elif not dataset._index["records"]:
                 raise DatasetError(f"{path / INDEX}: no episode has been stored yet; collect some first")
-            dataset._check_files()
+            dataset._files.check(dataset._index["records"])
             if dataset._index["records"]:
                 dataset._check_content()
             if verify:
@@ -194,7 +189,7 @@ class EpisodeDataset:
         the system. Change a clone.
         """
         if self._records is None or len(self._records) != self._index["records"]:
-            self._records = self._map().lock_()
+            self._records = self._files.map(self._index["records"]).lock_()
         return self._records
 
     @property
@@ -275,13 +270,10 @@ class EpisodeDataset:
         """
         self._check_writing()
         records = self._check_new(records)
-        start, checksum = self._index["records"], 0
+        start = self._index["records"]
         with self._named_failures("write"):
-            self._check_files()
-            for name, (file, shape, dtype) in self._files().items():
-                frames = _bytes(records[tuple(name.split("/"))])
-                _write(file, start * prod(shape) * dtype.itemsize, frames)
-                checksum = zlib.crc32(frames, checksum)
+            self._files.check(self._index["records"])
+            checksum = self._files.write(records, start)
             changes = {"records": start + len(records), "episode_lengths": [*self.episode_lengths, len(records)]}
             if "checksums" in self._index:
                 changes["checksums"] = [*self._index["checksums"], checksum]
@@ -305,50 +297,17 @@ class EpisodeDataset:
         """
         if "checksums" not in self._index:
             raise DatasetError(f"{self.path / INDEX}: was made without checksums; its frames cannot be verified")
-        changed = [number for number, checksum in enumerate(self._index["checksums"]) if self._sum(number) != checksum]
+        stored = enumerate(self._index["checksums"])
+        changed = [number for number, checksum in stored if self._files.checksum(self[number]) != checksum]
         if changed:
             raise DatasetError(
-                f"{self.path / _FRAMES}: the frames of episodes {changed} are not those that were stored; copy or "
+                f"{self.path / FRAMES}: the frames of episodes {changed} are not those that were stored; copy or "
                 "collect them again"
             )
 
-    def _sum(self, episode: int) -> int:
-        checksum, records = 0, self[episode]
-        for name in self._index["keys"]:
-            checksum = zlib.crc32(_bytes(records[tuple(name.split("/"))]), checksum)
-        return checksum
-
-    # Files.
-
-    def _files(self) -> dict[str, tuple[Path, list[int], torch.dtype]]:
-        return {
-            name: (self.path / _FRAMES / f"{name}.memmap", shape, DTYPES[dtype])
-            for name, (shape, dtype) in self._index["keys"].items()
-        }
-
-    def _make_files(self) -> None:
-        for file, _, _ in self._files().values():
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.touch()
-        for folder in {file.parent for file, _, _ in self._files().values()} | {self.path, self.path.parent}:
-            sync(folder)
-
-    def _check_files(self) -> None:
-        """Every file of the index is there, a file of this folder, and long enough; there is no other."""
-        files = self._files()
-        for file, shape, dtype in files.values():
-            _check_file(file, self.path, self._index["records"] * prod(shape) * dtype.itemsize)
-        unknown = {*(self.path / _FRAMES).rglob("*.memmap")} - {file for file, _, _ in files.values()}
-        if unknown:
-            raise DatasetError(f"{min(unknown)}: {INDEX} does not know this file; they belong to different datasets")
-
-    def _map(self) -> TensorDictBase:
-        """Private maps: nothing that is written to them reaches the files."""
-        records = self._index["records"]
-        frames: TensorDictBase = TensorDict({}, [records])
-        for name, (file, shape, dtype) in self._files().items() if records else ():
-            frames[tuple(name.split("/"))] = map_privately(file, (records, *shape), dtype)
-        return frames
+    @property
+    def _files(self) -> FrameFiles:
+        return FrameFiles(self.path, self._index["keys"])
 
     # Writing.
 
@@ -357,7 +316,7 @@ class EpisodeDataset:
             self._start_writing()
             self._index = read_index(self.path)  # as the writer before has left it
             if not self._index["records"]:
-                self._make_files()  # it may have been killed before
+                self._files.make()  # it may have been killed before
 
     def _start_writing(self) -> None:
         with ExitStack() as stack:
@@ -421,14 +380,14 @@ class EpisodeDataset:
         inits = self.records["is_init"].flatten().nonzero().flatten()
         if not torch.equal(inits, starts[:-1]):
             raise DatasetError(
-                f"{self.path / _FRAMES / 'is_init.memmap'}: episodes do not start where {INDEX} says; the files are "
+                f"{self.path / FRAMES / 'is_init.memmap'}: episodes do not start where {INDEX} says; the files are "
                 "corrupt or belong to different datasets"
             )
         bad = _not_finite(self.records)
         if bad is not None:
-            raise DatasetError(f"{self.path / _FRAMES / bad}.memmap: holds NaN or infinity; the dataset is corrupt")
+            raise DatasetError(f"{self.path / FRAMES / bad}.memmap: holds NaN or infinity; the dataset is corrupt")
         if "task" in self._index:
-            check_values(self.records, self.episode_lengths, self.task, f"{self.path / _FRAMES}/")
+            check_values(self.records, self.episode_lengths, self.task, f"{self.path / FRAMES}/")
         release_pages(self.records)
 
 
@@ -436,35 +395,9 @@ def refuse_another(path: Path) -> None:
     """Raise where a dataset, or what is left of one, is in the way of a new one."""
     if (path / INDEX).exists():
         raise DatasetError(f"{path / INDEX}: there is a dataset here already; open it, or choose another folder")
-    left = next((path / _FRAMES).rglob("*.memmap"), None)
+    left = next(iter(stored_frames(path)), None)
     if left is not None:
         raise DatasetError(f"{left}: frames of a dataset without {INDEX}; move them away, or choose another folder")
-
-
-def _check_file(file: Path, folder: Path, needed: int) -> None:
-    """A file that is not there, too short, or a link to somewhere else is not mapped or written to."""
-    try:
-        status = file.lstat()
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be read ({error.strerror}); the dataset is corrupt") from error
-    inside = file.relative_to(folder).parents
-    if not stat.S_ISREG(status.st_mode) or any((folder / part).is_symlink() for part in inside if part.name):
-        raise DatasetError(f"{file}: is a link or no ordinary file; put the file itself there")
-    if status.st_size < needed:
-        raise DatasetError(f"{file}: {status.st_size} bytes, should be at least {needed}; the file was truncated")
-
-
-def _write(file: Path, offset: int, frames: memoryview) -> None:
-    """Write frames into a file and wait until they are on the disk."""
-    with file.open("r+b") as stream:
-        stream.seek(offset)
-        stream.write(frames)
-        stream.flush()
-        os.fsync(stream.fileno())
-
-
-def _bytes(frames: Tensor) -> memoryview:
-    return frames.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data
 
 
 def _not_finite(records: TensorDictBase) -> str | None:
