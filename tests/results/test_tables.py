@@ -43,7 +43,7 @@ def test_cube_move_on_the_same_data_in_the_readme() -> None:
     assert len(found.goals) == 100
     text = " ".join((ROOT / "README.md").read_text().split())
     assert f"`focus_lcp` scores {scores['focus_lcp']}, with images {scores['focus_lcp, image goals']}, " in text
-    assert f"`focus_pcp` {scores['focus_pcp']}, `focus` {scores['focus, weights 1']} with weights of 1, " in text
+    assert f"`focus_pcp` {scores['focus_pcp']}, `focus` {scores['focus, weights 1']} with weights of 1 and " in text
+    assert f"{scores['focus, weights 200']} with 200, `dreamer_pcp`" in text
     assert f"`dreamer_pcp` {scores['dreamer_pcp']}, `dreamer` {scores['dreamer, weights 1']} with weights of 1 " in text
     assert f"and {scores['dreamer, weights 200']} with 200, random actions {scores['random']} ([one seed]" in text
-    assert ("focus, weights 200" in scores) != ("`focus` with 200 is not done yet" in text)
