@@ -16,7 +16,7 @@ from torchrl_ocwm.agents import build_agent
 from torchrl_ocwm.data import Collection, collect
 from torchrl_ocwm.envs import make_task
 from torchrl_ocwm.evaluation import Report
-from torchrl_ocwm.evidence import Collected, Evaluated, Explored, Record, RecordError, Trained, share
+from torchrl_ocwm.evidence import Collected, Data, Evaluated, Explored, Record, RecordError, Trained, share
 from torchrl_ocwm.testing import reacher_task
 
 COLLECTED = Collected(env="reacher", options={"image_size": 16}, policies={"scripted": 30, "random": 12})
@@ -28,7 +28,7 @@ def evaluated(tmp_path: Path) -> Path:
     return make_evaluated(tmp_path, COLLECTED)
 
 
-def make_evaluated(tmp_path: Path, data: Collected | Explored) -> Path:
+def make_evaluated(tmp_path: Path, data: Data) -> Path:
     trained = Trained(data=data, agent="dreamer_pcp", size="debug", seed=3, updates=1_200)
     run = Evaluated(trained=trained, goals=1, episode_steps=7)
     agent = build_agent("dreamer_pcp", make_task("reacher", image_size=16), "debug")

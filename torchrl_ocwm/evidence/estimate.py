@@ -17,7 +17,7 @@ from torchrl_ocwm.envs import Task, make_env, make_task
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs
 from torchrl_ocwm.evidence.queue import to_do
 from torchrl_ocwm.evidence.records import RECORD, Record
-from torchrl_ocwm.evidence.runs import Collected, Evaluated, Explored, Run, Trained
+from torchrl_ocwm.evidence.runs import Collected, Data, Evaluated, Explored, Run, Trained
 from torchrl_ocwm.evidence.settings import Machine
 from torchrl_ocwm.origin import machine
 from torchrl_ocwm.settings import change
@@ -145,7 +145,7 @@ def seconds_of_an_update(agent: Agent, how: Machine) -> float:
         torch.set_num_threads(threads)
 
 
-def seconds_of_a_step(run: Collected | Explored) -> float:
+def seconds_of_a_step(run: Data) -> float:
     """Of the environment of a dataset, with random actions."""
     with closing(make_env(run.env, **run.options)) as env:
         env.rollout(1)

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchrl_ocwm.evidence.figures import FIGURES, Row
 from torchrl_ocwm.evidence.options import all_options
-from torchrl_ocwm.evidence.runs import Collected, Evaluated, Explored, Trained
+from torchrl_ocwm.evidence.runs import Collected, Data, Evaluated, Explored, Trained
 from torchrl_ocwm.evidence.settings import Evidence
 from torchrl_ocwm.evidence.setups import BUDGETS, SETUPS, Budget, Setup
 from torchrl_ocwm.settings import SettingsError
@@ -73,7 +73,7 @@ def _evaluated(row: Row, env: str, seed: int, wanted: Evidence) -> Evaluated:
     )
 
 
-def _data(row: Row, env: str, steps: int, setup: Setup, budget: Budget, size: str) -> Collected | Explored:
+def _data(row: Row, env: str, steps: int, setup: Setup, budget: Budget, size: str) -> Data:
     small = setup.small if budget.small else {}
     options = {**setup.options, **small, **budget.options, **row.options}
     if row.data in ("random", "scripted"):

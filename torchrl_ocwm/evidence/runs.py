@@ -81,22 +81,39 @@ class Run(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Collected(Run):
-    """A dataset of policies that do not learn.
+class Data(Run):
+    """A dataset.
 
     Args:
         env: Where it is from.
         options: Of the environment, beside its defaults.
-        policies: Who collects, one after the other, and how many steps.
-        seed: Seeds episodes.
+        seed: Seeds all of it.
     """
 
     kind = "datasets"
 
     env: str
     options: Mapping[str, Any] = field(default_factory=dict)
-    policies: Mapping[str, int]
     seed: int = 0
+
+    def dataset(self, root: Path) -> Path:
+        """Where the dataset is."""
+        return root / self.name / "data"
+
+    def reached(self, root: Path) -> int:
+        """Steps collected."""
+        return steps_in(self.dataset(root))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collected(Data):
+    """A dataset of policies that do not learn.
+
+    Args:
+        policies: Who collects, one after the other, and how many steps.
+    """
+
+    policies: Mapping[str, int]
 
     @property
     def prefix(self) -> str:
@@ -132,42 +149,26 @@ class Collected(Run):
             commands.append(("collect", *shared, f"policy={policy}", f"steps={done}", path))
         return commands
 
-    def dataset(self, root: Path) -> Path:
-        """Where the dataset is."""
-        return root / self.name / "data"
-
-    def reached(self, root: Path) -> int:
-        """Steps collected."""
-        return steps_in(self.dataset(root))
-
 
 @dataclass(frozen=True, kw_only=True)
-class Explored(Run):
+class Explored(Data):
     """A dataset of an agent, which learns from what it has collected.
 
     Args:
-        env: Where it is from.
-        options: Of the environment, beside its defaults.
         explorer: The agent, a row.
         size: Its size.
         steps: Environment steps.
         policies: Who collects the first steps, and how many; none: a tenth of them are random.
         update_ratios: Updates per step, of the first steps and of its own.
         round_episodes: Episodes of a round.
-        seed: Seeds all of it.
     """
 
-    kind = "datasets"
-
-    env: str
-    options: Mapping[str, Any] = field(default_factory=dict)
     explorer: str
     size: str
     steps: int
     policies: Mapping[str, int] = field(default_factory=dict)
     update_ratios: tuple[float, float] = (UPDATE_RATIO, UPDATE_RATIO)
     round_episodes: int = 2
-    seed: int = 0
 
     @property
     def prefix(self) -> str:
@@ -244,14 +245,6 @@ class Explored(Run):
             )
         ]
 
-    def dataset(self, root: Path) -> Path:
-        """Where the dataset is."""
-        return root / self.name / "data"
-
-    def reached(self, root: Path) -> int:
-        """Steps collected."""
-        return steps_in(self.dataset(root))
-
 
 @dataclass(frozen=True, kw_only=True)
 class Trained(Run):
@@ -269,7 +262,7 @@ class Trained(Run):
 
     kind = "trainings"
 
-    data: Collected | Explored
+    data: Data
     agent: str
     changes: Mapping[str, Any] = field(default_factory=dict)
     size: str
