@@ -35,7 +35,7 @@ class Reproduce(Evidence, Machine):
 
     Args:
         include: Folders of pages of this command, of this machine or another. Their runs count as done.
-        dry_run: Only say what there is to do, and how long it takes.
+        dry_run: Only say what there is to do, and how long it takes; pages to include are taken over all the same.
         output: Folder of all runs and figures. Give all figures the same.
     """
 
