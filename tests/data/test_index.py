@@ -10,6 +10,7 @@ import torch
 
 from torchrl_ocwm.data import DatasetError, EpisodeDataset
 from torchrl_ocwm.data import index as index_module
+from torchrl_ocwm.data.frames import FrameFiles
 from torchrl_ocwm.envs import Task, Workspace
 from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
 
@@ -36,7 +37,7 @@ def damaged(whole, monkeypatch):
         file.write_text(text)
         try:
             with monkeypatch.context() as patch:
-                patch.setattr(EpisodeDataset, "_map", None)
+                patch.setattr(FrameFiles, "map", None)
                 patch.setattr(torch, "frombuffer", None)
                 return EpisodeDataset.open(whole)
         finally:
