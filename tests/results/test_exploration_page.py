@@ -7,7 +7,7 @@ import re
 from typing import Any
 
 import pytest
-from reading import RESULTS, missing, unchecked
+from reading import RESULTS, cell, missing, report, unchecked
 
 NAME = "exploration"
 SHOWN = {
@@ -55,8 +55,19 @@ def test_table(env: str) -> None:
         assert f"| {name} | {point['steps']:,} | {point['visited']:.0%} | {point['moves']:.0%} |" in table
 
 
+def learnt() -> list[str]:
+    """How FOCUS + LCP does on the data of each."""
+    found = report("figures/exploration-reacher-cpu/reacher")
+    steps = json.loads((RESULTS / "figures/exploration-reacher-cpu/runs.json").read_text())
+    work = {record["work"] for name, record in steps.items() if name.startswith("datasets/")}
+    assert len(work) == 1
+    scores = {name: cell(found, f"focus_lcp on {name}", "final_score") for name in SHOWN}
+    first, *others = (f"of {shown} it scores {scores[name]}" for name, shown in SHOWN.items())
+    return [f"on {work.pop():,} steps {first}", *(one.replace("it scores ", "") for one in others)]
+
+
 def test_page() -> None:
     rare = {"random": 1, "scripted": 1, "plan2explore": 2, "focus_explore": 2}
-    sentences = [*measured("reacher", {}), *measured("cube_move", rare), *STATED]
+    sentences = [*measured("reacher", {}), *measured("cube_move", rare), *learnt(), *STATED]
     assert missing(NAME, sentences) == []
     assert unchecked(NAME, sentences) == []
