@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import pytest
@@ -19,6 +20,7 @@ import torch
 from torchrl_ocwm.errors import MissingPackageError
 from torchrl_ocwm.evidence import LAUNCHERS, Machine, Record, Run, RunFailedError, in_order, launchers, queue, work_off
 from torchrl_ocwm.evidence.command_line import Command
+from torchrl_ocwm.evidence.launchers import ClusterError
 
 #: Says that it has begun, in the order of all, and then does what its name says.
 SCRIPT = """
@@ -257,6 +259,41 @@ def test_each_run_has_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch, visible:
 def test_ray_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launchers, "find_spec", lambda name: None)
     with pytest.raises(MissingPackageError, match=r"launcher=ray needs Ray: pip install 'torchrl-ocwm\[ray\]'"):
+        LAUNCHERS["ray"](Machine(launcher="ray"))
+
+
+def slow_ray(monkeypatch: pytest.MonkeyPatch, fails: int) -> list[str]:
+    """Ray on a machine so busy that its first starts fail; what is asked of it."""
+    calls: list[str] = []
+
+    def init(**_: Any) -> None:
+        calls.append("init")
+        if calls.count("init") <= fails:
+            raise Exception("The current node timed out during startup.")
+
+    ray = SimpleNamespace(
+        exceptions=SimpleNamespace(RayError=RuntimeError),
+        is_initialized=lambda: False,
+        init=init,
+        shutdown=lambda: calls.append("shutdown"),
+        cluster_resources=lambda: {"CPU": 2},
+        remote=lambda **_: lambda function: function,
+    )
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setattr(launchers, "find_spec", lambda name: object())
+    return calls
+
+
+@pytest.mark.parametrize("fails", [0, 2])
+def test_ray_is_started_again_on_a_busy_machine(fails: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = slow_ray(monkeypatch, fails)
+    assert LAUNCHERS["ray"](Machine(launcher="ray")).slots == 2
+    assert calls == ["init", "shutdown"] * fails + ["init"]
+
+
+def test_ray_that_does_not_start_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow_ray(monkeypatch, fails=3)
+    with pytest.raises(ClusterError, match=r"Ray does not start \(The current node timed out during startup\.\)"):
         LAUNCHERS["ray"](Machine(launcher="ray"))
 
 

@@ -24,6 +24,7 @@ from torchrl_ocwm.errors import MissingPackageError, UserError
 from torchrl_ocwm.evaluation.output import OutputError
 from torchrl_ocwm.evaluation.report import ReportError
 from torchrl_ocwm.evidence import RecordError, RunFailedError
+from torchrl_ocwm.evidence.launchers import ClusterError
 from torchrl_ocwm.files import FolderInUseError, only_writer
 from torchrl_ocwm.parts import load_plugins
 from torchrl_ocwm.play import PlayError
@@ -37,6 +38,7 @@ from torchrl_ocwm.training.offline import EvaluationError
 KINDS = {
     CalibrationError: ValueError,
     SourceError: ValueError,
+    ClusterError: RuntimeError,
     CollectionError: RuntimeError,
     DatasetError: ValueError,
     DeviceError: ValueError,

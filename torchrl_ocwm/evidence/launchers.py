@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager
 from importlib.util import find_spec
 from itertools import count
 from threading import Event
+from types import ModuleType
 from typing import Any, Protocol
 
 import torch
@@ -20,6 +21,11 @@ from torchrl_ocwm.evidence.settings import Machine
 
 #: Does a job until it is done or an event is set, with some variables of the environment.
 Perform = Callable[[Any, Event, Mapping[str, str]], None]
+_STARTS = 3  # of Ray, whose own processes have 30 seconds to begin; on a busy machine that is too few
+
+
+class ClusterError(UserError, RuntimeError):
+    """Ray does not start; the message says what it says."""
 
 
 class Launcher(AbstractContextManager["Launcher"], Protocol):
@@ -76,6 +82,7 @@ class OnRay(Launcher):
 
     Raises:
         MissingPackageError: if Ray is missing, with the extra to install.
+        ClusterError: if it does not start.
     """
 
     def __init__(self, how: Machine) -> None:
@@ -86,7 +93,7 @@ class OnRay(Launcher):
         self._ray, self.failures = ray, (ray.exceptions.RayError, UserError)
         self._ours = not ray.is_initialized()
         if self._ours:
-            ray.init(log_to_driver=False, logging_level=logging.WARNING, ignore_reinit_error=True)
+            _start(ray)
         gpus = 1 if how.device == "cuda" else 0
         there = ray.cluster_resources()
         room = there.get("GPU", 0) if gpus else there.get("CPU", 1) // how.threads
@@ -108,6 +115,17 @@ class OnRay(Launcher):
 
 
 LAUNCHERS: dict[str, Callable[[Machine], Launcher]] = {"local": Local, "ray": OnRay}
+
+
+def _start(ray: ModuleType) -> None:
+    for left in reversed(range(_STARTS)):
+        try:
+            ray.init(log_to_driver=False, logging_level=logging.WARNING, ignore_reinit_error=True)
+            return
+        except Exception as error:  # what Ray raises has no type of its own
+            ray.shutdown()
+            if not left:
+                raise ClusterError(f"launcher=ray: Ray does not start ({error}); launcher=local needs none") from error
 
 
 def _as_task(perform: Perform, job: Any) -> None:
