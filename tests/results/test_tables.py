@@ -42,8 +42,11 @@ def test_cube_move_on_the_same_data_in_the_readme() -> None:
     scores = {row: cell(found, row, "final_score") for row in found.rows}
     assert len(found.goals) == 100
     text = " ".join((ROOT / "README.md").read_text().split())
+    seeds = {row: len(found.rows[row].seeds) for row in found.rows}
     assert f"`focus_lcp` scores {scores['focus_lcp']}, with images {scores['focus_lcp, image goals']}, " in text
-    assert f"`focus_pcp` {scores['focus_pcp']}, `focus` {scores['focus, weights 1']} with weights of 1 and " in text
-    assert f"{scores['focus, weights 200']} with 200, `dreamer_pcp`" in text
+    assert f"`focus_pcp` {scores['focus_pcp']}, random actions {scores['random']}. One seed so far: " in text
+    assert f"`focus` {scores['focus, weights 1']} with weights of 1 and {scores['focus, weights 200']} with 200" in text
     assert f"`dreamer_pcp` {scores['dreamer_pcp']}, `dreamer` {scores['dreamer, weights 1']} with weights of 1 " in text
-    assert f"and {scores['dreamer, weights 200']} with 200, random actions {scores['random']} ([one seed]" in text
+    assert f"and {scores['dreamer, weights 200']} with 200 ([all of it]" in text
+    two = {"focus_lcp", "focus_lcp, image goals", "focus_pcp", "random"}
+    assert seeds == {row: 2 if row in two else 1 for row in seeds}
