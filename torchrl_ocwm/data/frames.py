@@ -89,16 +89,17 @@ class FrameFiles:
         Raises:
             OSError: if that cannot be.
         """
+        frames = self._raw(records)
         for name, (shape, dtype) in self.keys.items():
-            _write(self._file(name), start * _size(shape, dtype), _bytes(records[_key(name)]))
-        return self.checksum(records)
+            _write(self._file(name), start * _size(shape, dtype), frames[name])
+        return _sum(frames.values())
 
     def checksum(self, records: TensorDictBase) -> int:
         """CRC 32 of all that records hold."""
-        checksum = 0
-        for name in self.keys:
-            checksum = zlib.crc32(_bytes(records[_key(name)]), checksum)
-        return checksum
+        return _sum(self._raw(records).values())
+
+    def _raw(self, records: TensorDictBase) -> dict[str, memoryview]:
+        return {name: _bytes(records[_key(name)]) for name in self.keys}
 
     def _file(self, name: str) -> Path:
         return self.folder / FRAMES / f"{name}.memmap"
@@ -138,6 +139,13 @@ def _write(file: Path, offset: int, frames: memoryview) -> None:
         stream.write(frames)
         stream.flush()
         os.fsync(stream.fileno())
+
+
+def _sum(frames: Iterable[memoryview]) -> int:
+    checksum = 0
+    for one in frames:
+        checksum = zlib.crc32(one, checksum)
+    return checksum
 
 
 def _bytes(frames: Tensor) -> memoryview:

@@ -15,8 +15,7 @@ from torchrl_ocwm.envs.camera import Camera, Frame
 from torchrl_ocwm.envs.colour_masks import ColourMasks
 from torchrl_ocwm.envs.missing import needs
 from torchrl_ocwm.envs.physics import check_physics
-from torchrl_ocwm.envs.positions import masks_to_positions
-from torchrl_ocwm.envs.projection import project, unproject
+from torchrl_ocwm.envs.positions import masks_to_positions, pixels_to_world
 from torchrl_ocwm.envs.task import SUCCESS_DISTANCE
 from torchrl_ocwm.envs.virtual_target import draw_target
 from torchrl_ocwm.envs.workspace import Workspace
@@ -474,14 +473,21 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         self._check_open()
         across = 2 if len(self._axes) == 3 else ({0, 1, 2} - set(self._axes)).pop()
         level = self._start[across] + (height if len(self._axes) == 3 else 0.0)
-        pose, intrinsics = self.camera.extrinsics(self.data), self._intrinsics.numpy()
-        world = unproject(np.asarray(point), intrinsics, pose, across, level)
-        return (world - self._start)[..., self._axes].astype(np.float32)
+        plane = torch.tensor([*np.eye(3)[across], level])
+        pixels, camera = torch.tensor(point, dtype=torch.float64), torch.from_numpy(self.camera.extrinsics(self.data))
+        world = pixels_to_world(pixels.reshape(-1, 2), self._intrinsics.double(), camera.double(), plane=plane)
+        if not world.isfinite().all():
+            raise ValueError(f"the camera does not see the plane of the goals at {pixels.tolist()} (column, row)")
+        relative = world.reshape(*pixels.shape[:-1], 3).numpy() - self._start
+        return relative[..., self._axes].astype(np.float32)
 
     def _project(self, position: np.ndarray, data: mujoco.MjData) -> np.ndarray:
         world = np.broadcast_to(self._start, (*position.shape[:-1], 3)).copy()
         world[..., self._axes] += position
-        return project(world, self._intrinsics.numpy(), self.camera.extrinsics(data))
+        pose = self.camera.extrinsics(data)
+        in_camera = (world - pose[:3, 3]) @ pose[:3, :3]
+        in_image = in_camera @ self._intrinsics.numpy().T
+        return in_image[..., :2] / in_image[..., 2:]
 
 
 def _any_of(geoms: np.ndarray, ids: list[int]) -> np.ndarray:
