@@ -328,7 +328,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--compile",
         action=argparse.BooleanOptionalAction,
-        help="compile the step, which takes minutes; by default as in training, on a GPU only",
+        help="compile the step, which takes minutes; not by default, as in training",
     )
     parser.add_argument("--mixed-precision", action="store_true", help="products and convolutions in bfloat16")
     parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)

@@ -90,7 +90,7 @@ def main() -> None:
     parser.add_argument(
         "--compile",
         action=argparse.BooleanOptionalAction,
-        help="compile the step, which takes minutes; by default as in training, on a GPU only",
+        help="compile the step, which takes minutes; not by default, as in training",
     )
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)

@@ -1,7 +1,8 @@
 """How much of what the processor can do goes into updates: GFLOP, operations and seconds of one, and its efficiency.
 
     python benchmarks/update_speed.py [--agents dreamer_pcp focus_lcp ...] [--sizes cpu small] [--rounds 9]
-        [--updates 2] [--threads 1] [--device cpu] [--mixed-precision] [--compile] [--before COMMIT]
+        [--updates 2] [--threads 1] [--device cpu] [--mixed-precision] [--compile] [--cudagraph]
+        [--before COMMIT]
 
 A round times a plain product of two 1024 x 1024 matrices in float32 and some updates on random records, so that a noisy
 machine slows both. Efficiency is the GFLOP of an update by the seconds it takes and the GFLOP/s of the product in the
@@ -27,6 +28,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +44,7 @@ ROOT = Path(__file__).parents[1]
 HEAD = ["agent", "GFLOP", "operations", "s/update", "product, GFLOP/s", "efficiency"]
 SIDE = 1024
 #: Options that a child needs, as it measures one agent at one size.
-SHARED = ("rounds", "updates", "threads", "device", "mixed_precision", "compile")
+SHARED = ("rounds", "updates", "threads", "device", "mixed_precision", "compile", "cudagraph")
 
 
 class Work(TorchDispatchMode):
@@ -71,9 +73,9 @@ class Update:
         torch.manual_seed(0)
         self.device, self.updates = options["device"], options["updates"]
         built = build_agent(agent, reacher_task(), size).to(self.device).train()
-        precision = {"mixed_precision": options["mixed_precision"]}
-        self.eager = make_stepper(built, Training(device=self.device, compile=False, cudagraph=False, **precision))
-        self.stepper = make_stepper(built, Training(device=self.device, compile=options["compile"], **precision))
+        training = Training(**{name: options[name] for name in ("device", "mixed_precision", "compile", "cudagraph")})
+        self.eager = make_stepper(built, replace(training, compile=False, cudagraph=False))
+        self.stepper = make_stepper(built, training)
         learning = SIZES[size].learning
         self.batch = random_records(reacher_task(), learning.batch_size, learning.slice_len).to(self.device)
         self.matrix = torch.rand(SIDE, SIDE, device=self.device)
@@ -123,7 +125,8 @@ class Child:
 
     def __init__(self, folder: Path, agent: str, size: str, options: dict[str, Any]) -> None:
         command = [sys.executable, __file__, "--child", agent, size, json.dumps(options)]
-        environment = {**os.environ, "PYTHONPATH": str(folder)}
+        path = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = {**os.environ, "PYTHONPATH": path}
         pipe = subprocess.PIPE
         self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment)
         self.flop, self.operations = self._read()
@@ -201,7 +204,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--mixed-precision", action="store_true", help="products and convolutions in bfloat16")
-    parser.add_argument("--compile", action=argparse.BooleanOptionalAction, help="by default as in training")
+    for name in ("compile", "cudagraph"):
+        parser.add_argument(f"--{name}", action=argparse.BooleanOptionalAction, help="by default as in training")
     parser.add_argument("--before", metavar="COMMIT", help="a commit to compare with")
     parser.add_argument("--child", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()

@@ -99,6 +99,13 @@ def test_an_evaluation_that_draws_and_films_nothing_loads_no_packages_for_that()
     assert done.returncode == 0, done.stderr
 
 
+def test_training_that_films_nothing_needs_no_ffmpeg() -> None:
+    blocked = "import sys; sys.modules['imageio_ffmpeg'] = None"
+    code = f"{blocked}; from torchrl_ocwm.evaluation import OpenLoopFilm, check_ffmpeg; check_ffmpeg('video_interval')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "pip install 'torchrl-ocwm[recipes]', or ask for none (video_interval=0)" in done.stderr
+
+
 def python(file: Path) -> list[str]:
     """The Python in a script, or in the blocks of a page."""
     text = file.read_text()

@@ -80,3 +80,11 @@ def test_what_the_sampler_does_to_a_batch() -> None:
     with torch.device("meta"):
         batch = RelabelGoals(TASK.workspace)(batch)
     assert devices(batch.values(True, True)) == {"meta"}
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_the_critic_that_actors_ask_moves_with_the_agent(name: str) -> None:
+    """To another dtype here, as to a GPU elsewhere: TorchRL's losses do not register it."""
+    for behaviour in build_agent(name, TASK, size="debug").double().loss.behaviours.values():
+        critic = behaviour.actor_loss.value_model
+        assert {tensor.dtype for tensor in (*critic.parameters(), *critic.buffers())} == {torch.float64}

@@ -26,6 +26,7 @@ from torchrl_ocwm.evidence.estimate import Forecast, Paces
 from torchrl_ocwm.origin import machine
 from torchrl_ocwm.settings import to_dict
 from torchrl_ocwm.testing import reacher_task
+from torchrl_ocwm.training.stepper import Stepper
 
 TINY = {"image_size": 16, "horizon": 20}
 DATA = Collected(env="reacher", options=TINY, policies={"random": 100})
@@ -106,6 +107,15 @@ def test_updates_are_timed_with_the_threads_of_the_runs(monkeypatch: pytest.Monk
     before, agent = torch.get_num_threads(), build_agent("dreamer", reacher_task(16), "debug")
     assert estimate.seconds_of_an_update(agent, Machine(threads=before + 1)) == before + 1
     assert torch.get_num_threads() == before
+
+
+def test_updates_that_a_gpu_captures_are_captured_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str] = []
+    monkeypatch.setattr(Stepper, "resolve", lambda self, device: (False, True))
+    monkeypatch.setattr(Stepper, "warmup", lambda self, sample: seen.append("warmup"))
+    monkeypatch.setattr(Stepper, "step", lambda self, trainer, sample: seen.append("step"))
+    estimate.seconds_of_an_update(build_agent("dreamer", reacher_task(16), "debug"), Machine())
+    assert seen[:2] == ["warmup", "step"]
 
 
 def test_episodes_that_are_played_meanwhile_take_their_time(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import operator
+import os
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -124,17 +126,37 @@ def test_speed_of_updates_beside_another_commit(
     assert 0 <= float(efficiency) < 1
 
 
+def test_a_child_has_the_library_of_its_folder_and_the_packages_of_its_parent(
+    update_speed: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", "packages")
+    started: dict[str, dict[str, str]] = {}
+    monkeypatch.setattr(update_speed.subprocess, "Popen", lambda command, env, **options: started.update(env=env))
+    monkeypatch.setattr(update_speed.Child, "_read", lambda self: [1, 2])
+    update_speed.Child(Path("folder"), "dreamer", "debug", {})
+    assert started["env"]["PYTHONPATH"] == os.pathsep.join(["folder", "packages"])
+
+
 def test_how_updates_are_timed(update_speed: ModuleType) -> None:
     """Options reach the update: here those that would not be seen in a table."""
-    options = {"rounds": 1, "updates": 3, "threads": 2, "device": "cpu", "mixed_precision": True, "compile": True}
+    options = {
+        "rounds": 1,
+        "updates": 3,
+        "threads": 2,
+        "device": "cpu",
+        "mixed_precision": True,
+        "compile": True,
+        "cudagraph": False,
+    }
     threads = torch.get_num_threads()
     try:
         update = update_speed.Update("dreamer", "debug", options)
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
-    assert (update.stepper.mixed_precision, update.stepper.compile_train_step) == (True, True)
-    assert (update.eager.mixed_precision, update.eager.compile_train_step) == (True, False)
+    how = operator.attrgetter("mixed_precision", "compile_train_step", "cudagraph")
+    assert how(update.stepper) == (True, True, False)
+    assert how(update.eager) == (True, False, False)
     calls = []
     update.stepper.step = lambda trainer, batch: calls.append(batch)
     update.round()

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import nn
 
+from torchrl_ocwm.modules import upsampling
 from torchrl_ocwm.modules.upsampling import upsample
 
 
@@ -25,3 +26,12 @@ def test_values_and_gradients_are_those_of_pytorch(
         torch.autograd.grad(got, inputs, gradient), torch.autograd.grad(expected, inputs, gradient), strict=True
     ):
         torch.testing.assert_close(one, other, atol=tolerance, rtol=tolerance)
+
+
+def test_what_compiles_or_is_elsewhere_is_pytorchs_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    layer, hidden = nn.ConvTranspose2d(3, 2, 5, 2, 2, 1), torch.randn(2, 3, 5, 4)
+    monkeypatch.setattr(upsampling, "_Interleave", None)
+    assert upsample(hidden.to("meta"), layer.to("meta"), 0.5).device.type == "meta"
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    layer = nn.ConvTranspose2d(3, 2, 5, 2, 2, 1)
+    assert torch.equal(upsample(hidden, layer, 0.5), layer(hidden) + 0.5)

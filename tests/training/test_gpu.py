@@ -19,6 +19,10 @@ pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
 ]
 
+compiles = pytest.mark.skipif(
+    not hasattr(torch._dynamo.config, "trace_autograd_ops"), reason="needs PyTorch 2.12 or newer"
+)
+
 
 def losses(name: str, updates: int = 3, **settings: Any) -> list[TensorDict]:
     """Losses of the first updates of a debug agent on one batch."""
@@ -37,7 +41,10 @@ def world_model_losses(steps: list[TensorDict]) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", ["dreamer", "dreamer_pcp"])
-@pytest.mark.parametrize(("compiled", "captured"), [(True, False), (False, True), (True, True)])
+@pytest.mark.parametrize(
+    ("compiled", "captured"),
+    [pytest.param(True, False, marks=compiles), (False, True), pytest.param(True, True, marks=compiles)],
+)
 def test_compiled_and_captured_updates_are_close_to_eager(name: str, compiled: bool, captured: bool) -> None:
     eager = world_model_losses(losses(name, compile=False, cudagraph=False))
     fast = world_model_losses(losses(name, compile=compiled, cudagraph=captured))
@@ -51,4 +58,6 @@ def test_bfloat16_is_finite_and_close(name: str) -> None:
     half = losses(name, compile=False, cudagraph=False, mixed_precision=True)
     for step in half:
         assert all(value.isfinite().all() for key, value in step.items() if key.startswith("loss_"))
-    torch.testing.assert_close(world_model_losses(half), world_model_losses(single), rtol=0.05, atol=0.05)
+    # Of the first update: later ones have other weights, too.
+    first = [world_model_losses(steps[:1]) for steps in (half, single)]
+    torch.testing.assert_close(*first, rtol=0.05, atol=0.05)

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import torch
-from torchrl.checkpoint import Checkpoint, CheckpointError
+from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState
 from torchrl.record.loggers import CSVLogger
 
 import torchrl_ocwm
@@ -126,6 +126,19 @@ class TestResume:
         for number in (0, 3):
             train(fresh(), dataset, tmp_path / str(number), replace(SHORT, updates=2, threads=number))
         assert threads == [3]
+
+    def test_a_run_of_a_gpu_goes_on_without_one(
+        self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Here its first updates are made without one too, so that they are the same."""
+        through, last = fresh(), fresh()
+        train(through, dataset, tmp_path / "through")
+        of_cpu = GlobalRNGState.state_dict
+        with monkeypatch.context() as there:
+            there.setattr(GlobalRNGState, "state_dict", lambda self: {**of_cpu(self), "torch_cuda": [torch.zeros(1)]})
+            train(fresh(), dataset, tmp_path / "parts", evaluate=signal_at(4, signal.SIGTERM))
+        train(last, dataset, tmp_path / "parts")
+        assert same(last, through)
 
     def test_seed_changes_the_run(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         first, second = fresh(), fresh()

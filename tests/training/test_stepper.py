@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 
 from torchrl_ocwm.agents import EXPLORERS, build_agent
+from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.testing import random_records, reacher_task
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_schedule, make_stepper, one_graph
@@ -38,6 +39,7 @@ def test_mixed_precision_works_on_a_cpu() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not hasattr(torch._dynamo.config, "trace_autograd_ops"), reason="needs PyTorch 2.12 or newer")
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
@@ -86,6 +88,13 @@ def test_learning_rates_fall_linearly_and_stay_at_the_end() -> None:
 def test_a_run_that_goes_on_for_longer_follows_its_new_settings() -> None:
     _, finished = rates(Training(updates=4, log_interval=1, final_lr=0.1))
     assert rates(Training(updates=8, log_interval=1, final_lr=0.2), finished)[0] == pytest.approx([1.0, 0.8, 0.6, 0.4])
+
+
+def test_a_pytorch_that_cannot_compile_is_named_at_once(make_agent: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(torch._dynamo.config, "trace_autograd_ops")
+    with pytest.raises(SettingsError, match=r"compile=true needs PyTorch 2.12 or newer, this is .*; leave it null"):
+        make_stepper(make_agent(), Training(compile=True))
+    assert not make_stepper(make_agent(), Training()).compile_train_step
 
 
 @pytest.mark.parametrize("compiles", [True, False])

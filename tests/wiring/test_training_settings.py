@@ -172,7 +172,7 @@ def test_goals(run: Callable[..., Run], dataset: EpisodeDataset, goals: str) -> 
 
 @shows("Training.compile", "Training.cudagraph")
 def test_compiled_or_captured(monkeypatch: pytest.MonkeyPatch, run: Callable[..., Run]) -> None:
-    """Before the first update, where it is asked for or there is a GPU."""
+    """Before the first update: compiled where it is asked for, captured there or on a GPU."""
     warm: list[bool] = []
     monkeypatch.setattr(Stepper, "warmup", lambda self, sample: warm.append(True))
     for settings, expected in (({}, 0), ({"compile": True}, 1), ({"compile": False}, 0), ({"cudagraph": True}, 1)):
@@ -180,7 +180,7 @@ def test_compiled_or_captured(monkeypatch: pytest.MonkeyPatch, run: Callable[...
         stepper = make_stepper(agent, Training(**settings))
         cpu, cuda = (stepper.resolve(torch.device(place)) for place in ("cpu", "cuda"))
         assert cpu == (settings.get("compile", False), settings.get("cudagraph", False))
-        assert cuda == (settings.get("compile", True), settings.get("cudagraph", True))
+        assert cuda == (settings.get("compile", False), settings.get("cudagraph", True))
         monkeypatch.setattr(Stepper, "step", lambda self, trainer, batch: TensorDict({"loss_actor": torch.zeros(())}))
         warm.clear()
         run(updates=1, **settings)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import imageio.v3 as imageio
-import imageio_ffmpeg
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -107,6 +106,8 @@ def videos_beside() -> Iterator[WriteVideo]:
 def _frames(file: Path) -> int:
     """How many frames a video has; none, if it is broken."""
     try:
+        import imageio_ffmpeg  # may be missing where no videos are written
+
         return imageio_ffmpeg.count_frames_and_secs(file)[0]
     except RuntimeError:
         return 0

@@ -136,9 +136,11 @@ def seconds_of_an_update(agent: Agent, how: Machine) -> float:
     threads = torch.get_num_threads()
     torch.set_num_threads(how.threads)
     try:
-        stepper = make_stepper(agent.to(how.device).train(), Training(device=how.device, compile=False))
+        stepper = make_stepper(agent.to(how.device).train(), Training(device=how.device))
         learning = agent.size.learning
         batch = random_records(agent.task, learning.batch_size, learning.slice_len).to(how.device)
+        if any(stepper.resolve(torch.device(how.device))):
+            stepper.warmup(batch.copy())
         stepper.step(None, batch.copy())
         return _seconds(lambda: [stepper.step(None, batch.copy()) for _ in range(_UPDATES)], _UPDATES)
     finally:

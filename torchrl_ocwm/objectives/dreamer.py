@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import nn
+from torch import Tensor, nn
 from torchrl.objectives import DreamerV3ActorLoss, DreamerV3ModelLoss, DreamerV3ValueLoss, LossModule
 
 
@@ -91,6 +91,12 @@ class BehaviourLoss(LossModule):
         # TorchRL's losses do not say what they read and write, and cannot be printed without.
         actor_loss.in_keys, actor_loss.out_keys = ["latent"], ["loss_actor"]
         value_loss.in_keys, value_loss.out_keys = ["latent", "lambda_target"], ["loss_value"]
+
+    def _apply(self, fn: Callable[[Tensor], Tensor]) -> BehaviourLoss:
+        # TorchRL's actor loss hides its critic from PyTorch: parameters are the critic's, buffers stay where they were.
+        for module in self.actor_loss.value_model.modules():
+            module._buffers.update({name: fn(buffer) for name, buffer in module.named_buffers(recurse=False)})
+        return super()._apply(fn)
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         pass

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase, unravel_key
-from torchrl.checkpoint import CheckpointError, GlobalRNGState
+from torchrl.checkpoint import CheckpointError
 from torchrl.trainers import LRSchedulerHook
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 
@@ -26,6 +26,7 @@ from torchrl_ocwm.training.evaluations import Evaluate, Evaluations
 from torchrl_ocwm.training.hooks import EveryUpdates, LossLog, ProgressBar, RunTrainer, StopOnSignals, UpdateClock
 from torchrl_ocwm.training.loggers import make_loggers
 from torchrl_ocwm.training.provenance import check_may_go_on, trained_with
+from torchrl_ocwm.training.random_state import RandomState
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_schedule, make_stepper
 
@@ -71,7 +72,7 @@ class Run:
         sample = TrainingBatches(agent, dataset, training)
         stepper = make_stepper(agent, training)
         checkpoint = Archive(
-            agent=describe(agent), rng=GlobalRNGState(), metadata={"trained_with": trained_with(training, dataset)}
+            agent=describe(agent), rng=RandomState(), metadata={"trained_with": trained_with(training, dataset)}
         )
         self.trainer = _make_trainer(agent, training, stepper, checkpoint, file, clock or UpdateClock())
         self.stop = StopOnSignals(self.trainer)

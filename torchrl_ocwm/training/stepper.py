@@ -17,6 +17,7 @@ from torchrl.trainers.algorithms import DreamerV3OptimizationStepper
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.objectives import GoalConditionedDreamerLoss
+from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.training.allocator import keep_freed_memory
 from torchrl_ocwm.training.settings import Training
 
@@ -28,10 +29,17 @@ def make_schedule(optimizer: Optimizer, training: Training) -> LambdaLR:
 
 
 def one_graph() -> AbstractContextManager[None]:
-    """Let ``torch.compile`` trace a backward pass together with what it differentiates, where it knows how to."""
+    """Let ``torch.compile`` trace a backward pass together with what it differentiates.
+
+    Raises:
+        SettingsError: if this PyTorch cannot.
+    """
     dynamo = torch._dynamo.config
-    known = hasattr(dynamo, "trace_autograd_ops")  # since PyTorch 2.12
-    return dynamo.patch(trace_autograd_ops=True) if known else nullcontext()
+    if not hasattr(dynamo, "trace_autograd_ops"):  # PyTorch 2.11 makes wrong code of the parts, after minutes
+        raise SettingsError(
+            f"training.compile=true needs PyTorch 2.12 or newer, this is {torch.__version__}; leave it null"
+        )
+    return dynamo.patch(trace_autograd_ops=True)
 
 
 def one_at_a_time() -> FileLock:
@@ -66,7 +74,8 @@ class Stepper(DreamerV3OptimizationStepper):
         device = sample.get("action").device
         compiles, _ = self.resolve(device)
         # Inductor's C++ for both passes in bfloat16 declares a variable twice (PyTorch 2.13); apart, they compile.
-        graph = nullcontext() if device.type == "cpu" and self.mixed_precision else one_graph()
+        apart = device.type == "cpu" and self.mixed_precision
+        graph = one_graph() if compiles and not apart else nullcontext()
         with graph, one_at_a_time() if compiles else nullcontext():
             super().warmup(sample)
 
@@ -104,14 +113,20 @@ class SlowCritics:
 
 
 def make_stepper(agent: Agent, training: Training) -> DreamerV3OptimizationStepper:
-    """A stepper: forward, backward, optimiser and slow critic. On a CPU the process keeps the memory that they free."""
+    """A stepper: forward, backward, optimiser and slow critic. On a CPU the process keeps the memory that they free.
+
+    Raises:
+        SettingsError: if it is to be compiled, and this PyTorch cannot.
+    """
+    if training.compile:
+        one_graph()
     if torch.device(training.device).type == "cpu":
         keep_freed_memory()
     return Stepper(
         agent.loss,
         agent.size.learning.optimizer.build(agent.parameter_groups()),
         SlowCritics(agent.loss, tau=training.target_rate),
-        compile_train_step=training.compile,
+        compile_train_step=bool(training.compile),
         cudagraph=training.cudagraph,
         mixed_precision=training.mixed_precision,
     )
