@@ -30,6 +30,7 @@ from torchrl_ocwm.evaluation import (
     transition,
 )
 from torchrl_ocwm.evaluation.episodes import SteppedEnvs
+from torchrl_ocwm.evaluation.landmarks import LandmarkEpisodes
 from torchrl_ocwm.processes import LocalWorker, WorkerError
 from torchrl_ocwm.settings import SettingsError
 from torchrl_ocwm.testing import random_records, reacher_task
@@ -371,10 +372,22 @@ def test_landmarks_are_drawn_anew_each_time(task: Task, monkeypatch: pytest.Monk
     assert len({tuple(numbers.tolist()) for _, numbers in played}) > 3
 
 
-def test_landmarks_are_given_as_images_to_agents_that_take_nothing_else(task: Task) -> None:
-    agent, seen = build_agent("lexa_temporal", task, size="debug"), []
+def test_landmarks_are_played_where_the_environment_is(task: Task) -> None:
+    """An agent of another dtype stands for one on a GPU: observations do not go through its own weights."""
+    agent = build_agent("dreamer_pcp", task, "debug")
+    with LandmarkEvaluation(agent, episodes=2, episode_steps=3) as evaluation:
+        scores = evaluation(0)
+        agent.double()
+        assert evaluation(0) == scores
+
+
+def test_landmarks_are_given_as_images_to_agents_that_take_nothing_else(
+    task: Task, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent, seen, act = build_agent("lexa_temporal", task, size="debug"), [], LandmarkEpisodes._act
+    noted = lambda self, step: seen.append(step["goal", "pixels"]) or act(self, step)  # noqa: E731
+    monkeypatch.setattr(LandmarkEpisodes, "_act", noted)
     with LandmarkEvaluation(agent, episodes=2, episode_steps=2) as evaluation:
-        evaluation.policy.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]["goal", "pixels"]))
         scores = evaluation(0)
         chosen = torch.randperm(10, generator=torch.Generator().manual_seed(0))[:2].sort().values
         expected = goal_images(task, evaluation.goals[chosen])

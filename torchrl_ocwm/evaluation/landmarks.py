@@ -9,13 +9,13 @@ from functools import partial
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from torchrl_ocwm.agents.agent import Agent
 from torchrl_ocwm.envs import ENVIRONMENTS, Task, environment_of
 from torchrl_ocwm.envs.registry import Environment
-from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, Policy, goal_images, measure
+from torchrl_ocwm.evaluation.episodes import EvaluationEnvs, goal_images, measure
 from torchrl_ocwm.processes import Worker, make_worker
 from torchrl_ocwm.settings import SettingsError
 
@@ -43,7 +43,7 @@ def can_play(task: Task) -> bool:
 
 
 class LandmarkEvaluation:
-    """Evaluate an agent on its task's landmark goals, in this process or beside it.
+    """Evaluate an agent on its task's landmark goals, in this process or beside it: a copy of its weights, on the CPU.
 
     An agent that takes goals as images only is given images of them.
 
@@ -57,7 +57,7 @@ class LandmarkEvaluation:
         agent: The agent in training.
         episodes: Episodes, to as many of the landmarks, drawn anew at each call.
         episode_steps: Steps of each.
-        beside: Evaluate a copy of the weights in a process of its own, on the CPU. It starts at once.
+        beside: Evaluate in a process of its own. It starts at once.
 
     Raises:
         SettingsError: if there are more episodes than landmarks.
@@ -70,8 +70,8 @@ class LandmarkEvaluation:
         self.policy, self.goals, self.episodes = agent.policy(), torch.tensor(landmarks), episodes
         self.beside, index = beside, self.policy.object_index
         images = None if self.policy.takes_positions else goal_images(task, self.goals, object_index=index)
-        # Without the agent that a policy knows.
-        acts = deepcopy(TensorDictSequential(*self.policy.module)).cpu() if beside else self.policy
+        # A copy where the environments are, wherever the agent learns; without the agent that a policy knows.
+        acts = deepcopy(TensorDictSequential(*self.policy.module)).cpu()
         make = partial(LandmarkEpisodes, acts, environment_of(task), task, self.goals, images, index)
         self._worker: Worker = make_worker(partial(make, episode_steps, episodes), process=beside, timeout=_TIMEOUT)
         self._is_ready = False
@@ -82,7 +82,7 @@ class LandmarkEvaluation:
             self._worker.ready()
             self._is_ready = True
         drawn = torch.randperm(len(self.goals), generator=torch.Generator().manual_seed(updates))
-        weights = {name: value.cpu() for name, value in self.policy.state_dict().items()} if self.beside else None
+        weights = {name: value.cpu() for name, value in self.policy.state_dict().items()}
         self._worker.request("scores", weights, drawn[: self.episodes].sort().values)
         return self._worker if self.beside else self._worker.answer()
 
@@ -114,7 +114,7 @@ class LandmarkEpisodes:
 
     def __init__(
         self,
-        policy: Policy,
+        policy: TensorDictModuleBase,
         environment: Environment,
         task: Task,
         goals: Tensor,
@@ -129,11 +129,9 @@ class LandmarkEpisodes:
         self.envs = EvaluationEnvs(task, episode_steps=episode_steps, workers=0, envs=episodes)
         self.alive = alive
 
-    def scores(self, weights: dict[str, Tensor] | None, chosen: Tensor) -> dict[str, float]:
-        """Means over the goals of these numbers ``[E]``, with these weights of the policy if they are given."""
-        if weights is not None:
-            assert isinstance(self.policy, torch.nn.Module)
-            self.policy.load_state_dict(weights)
+    def scores(self, weights: dict[str, Tensor], chosen: Tensor) -> dict[str, float]:
+        """Means over the goals of these numbers ``[E]``, with these weights of the policy."""
+        self.policy.load_state_dict(weights)
         images = None if self.images is None else self.images[chosen]
         episodes = self.envs.run(self._act, self.goals[chosen], images=images, numbers=chosen)
         scores = measure(episodes, object_index=self.object_index)
