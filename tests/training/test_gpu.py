@@ -1,7 +1,8 @@
-"""One update on a GPU: compiled, captured in a CUDA graph, in bfloat16."""
+"""Updates on a GPU: compiled, captured in a CUDA graph, in bfloat16; runs that begin or go on there."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,8 +10,11 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_ocwm.agents import SIZES, build_agent
+from torchrl_ocwm.evidence import Machine
+from torchrl_ocwm.evidence.estimate import seconds_of_an_update
 from torchrl_ocwm.settings import change
-from torchrl_ocwm.testing import random_records, reacher_task
+from torchrl_ocwm.testing import random_dataset, random_records, reacher_task
+from torchrl_ocwm.training.offline import train_offline
 from torchrl_ocwm.training.settings import Training
 from torchrl_ocwm.training.stepper import make_stepper
 
@@ -61,3 +65,19 @@ def test_bfloat16_is_finite_and_close(name: str) -> None:
     # Of the first update: later ones have other weights, too.
     first = [world_model_losses(steps[:1]) for steps in (half, single)]
     torch.testing.assert_close(*first, rtol=0.05, atol=0.05)
+
+
+@pytest.mark.parametrize(("first", "then"), [("cuda", "cpu"), ("cpu", "cuda")])
+def test_a_run_goes_on_elsewhere(tmp_path: Path, first: str, then: str) -> None:
+    dataset = random_dataset(tmp_path / "data", reacher_task())
+    for device, updates in ((first, 2), (then, 4)):
+        agent = build_agent("dreamer_pcp", reacher_task(), "debug")
+        training = Training(device=device, updates=updates, log_interval=1, eval_interval=0, final_lr=1)
+        train_offline(agent, dataset, tmp_path / "run", training, progress=False)
+        assert next(agent.parameters()).device.type == device
+    log = (tmp_path / "run" / "log" / "scalars" / "loss_value.csv").read_text()
+    assert [int(line.split(",")[0]) for line in log.splitlines()] == [1, 2, 3, 4]
+
+
+def test_updates_can_be_timed_for_a_forecast() -> None:
+    assert 0 < seconds_of_an_update(build_agent("dreamer", reacher_task(), "debug"), Machine(device="cuda")) < 10
