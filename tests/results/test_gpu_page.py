@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from reading import RESULTS, curve, missing, settings, unchecked
+from reading import RESULTS, ROOT, curve, missing, settings, unchecked
 
 NAME = "gpu"
 LOSSES = {
@@ -66,6 +66,8 @@ def test_speed() -> None:
         *STATED,
     ]
     assert "medians of 5 rounds of 10 updates" in printed
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    assert f"takes {1000 * captured:.0f} ms at size `cpu` and {1000 * small:.0f} ms at `small`" in readme
     assert missing(NAME, sentences) == []
     assert unchecked(NAME, sentences) == []
 
