@@ -119,7 +119,7 @@ def make_stepper(agent: Agent, training: Training) -> DreamerV3OptimizationStepp
         SettingsError: if it is to be compiled, and this PyTorch cannot.
     """
     if training.compile:
-        one_graph()
+        one_graph()  # raises now, not after minutes
     if torch.device(training.device).type == "cpu":
         keep_freed_memory()
     return Stepper(
