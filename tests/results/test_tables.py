@@ -45,12 +45,8 @@ def test_cube_move_on_the_same_data_in_the_readme() -> None:
     seeds = {row: len(found.rows[row].seeds) for row in found.rows}
     assert f"`focus_lcp` scores {scores['focus_lcp']}, with images {scores['focus_lcp, image goals']}, " in text
     assert f"`focus_pcp` {scores['focus_pcp']}, `dreamer_pcp` {scores['dreamer_pcp']}, " in text
-    focus, dreamer = ([scores[f"{agent}, weights {weight}"] for weight in (1, 200)] for agent in ("focus", "dreamer"))
-    assert (
-        f"`focus` {focus[0]} with weights of 1 and {focus[1]} with 200, `dreamer` {dreamer[0]} with weights of 1"
-        in text
-    )
-    assert (
-        f"random actions {scores['random']}; one seed so far of `dreamer` with 200, {dreamer[1]} ([all of it]" in text
-    )
-    assert seeds == {row: 1 if row == "dreamer, weights 200" else 2 for row in seeds}
+    for agent in ("focus", "dreamer"):
+        light, heavy = (scores[f"{agent}, weights {weight}"] for weight in (1, 200))
+        assert f"`{agent}` {light} with weights of 1 and {heavy} with 200, " in text
+    assert f"random actions {scores['random']} ([all of it]" in text
+    assert set(seeds.values()) == {2}
