@@ -10,6 +10,7 @@ from reading import RESULTS, curve, mean, missing, report, settings, unchecked
 NAME = "cube_move/more_updates"
 HERE = RESULTS / NAME
 BEFORE = f"{NAME}/7500/cube_move"
+TABLE = "figures/table-cube_move-cpu/cube_move"
 #: What was done: no file beside the page has these numbers.
 STATED = [
     "**After 7,500 updates on it, an agent that does not act itself hardly moves the cube; after 15,000 it does.**",
@@ -49,6 +50,21 @@ def collected() -> list[str]:
     return [f"{rounds} and {metres[-1]:.0f} cm from the goal in its five rounds", f"{steps:,.0f} steps in all"]
 
 
+def longer() -> list[str]:
+    """Twice as long from the start, and the same seed of the table."""
+    twice, table = (report(name).rows["focus_pcp"] for name in (f"{NAME}/30000/cube_move", TABLE))
+    assert (len(twice.seeds), twice.seeds[0]["final_score"].shape) == (1, (100,))
+    score, before = (float(row.seeds[0]["final_score"].mean()) for row in (twice, table))
+    success, less = (float(row.seeds[0]["success"].mean()) for row in (twice, table))
+    readme = " ".join((RESULTS.parents[1] / "README.md").read_text().split())
+    assert f"with twice as many, `focus_pcp` has {score:.2f} ([one seed]" in readme
+    return [
+        f"on the same data: {score:.2f} after 30,000 updates**, where the same seed has {before:.2f} after 15,000",
+        f"within 5 cm of {success:.0%} of the goals, not of {less:.0%}",
+        "([the figure's page](30000/README.md), one seed)",
+    ]
+
+
 def test_page() -> None:
     before, after = report(BEFORE), report(NAME)
     scores = [mean(one, "focus_pcp", "final_score") for one in (before, after)]
@@ -59,6 +75,7 @@ def test_page() -> None:
         f"FOCUS + LCP has {lcp[0]:.2f} after 7,500, with images {lcp[1]:.2f}, random actions {lcp[2]:.2f}",
         f"expects to end {believed:.1f} cm from the goal, and ends {real:.1f} cm from it",
         f"{len(after.goals)} goals, {after.settings['episode_steps']} steps each; one seed",
+        *longer(),
         *curves(),
         *collected(),
         *STATED,
