@@ -19,7 +19,7 @@ STATED = [
     "PyTorch 2.11.0, for 15 minutes in all",
     "the first 1,400 updates, not for a whole training",
     "128 frames of 64 × 64",
-    "FOCUS + PCP made 49.8 updates per second on Cube move's data",
+    "a loss of `dreamer_pcp` was 6.2% off, where 5% is allowed. Why is not known; on a CPU it is within 1%",
     "at 32 × 32",
     "the two seeds of the table",
     "a mean over 50 updates",
@@ -50,6 +50,7 @@ def test_speed() -> None:
     fetched = re.search(r"sample +(\S+) ms", (RESULTS / NAME / "sampling_share.txt").read_text())
     assert share
     assert fetched
+    last = re.findall(r" 1400/15000 .*?, +(\S+)update/s", (RESULTS / NAME / "train.txt").read_text())[-1]
     cpu = (RESULTS / "benchmarks.md").read_text()
     assert re.search(r"\| focus_lcp \| 12 \| 8,941 \| 0.212 \|", cpu)
     assert re.search(r"\| focus_lcp \| 409 \| 14,951 \| 3.47 \|", cpu)
@@ -63,6 +64,7 @@ def test_speed() -> None:
         f"{fetched[1]} ms for",
         f"the first 1,400 of {settings(NAME, 'config')['training']['updates']:,}",
         f"updates with seed {settings(NAME, 'config')['training']['seed']}",
+        f"FOCUS + PCP made {float(last):.1f} updates per second on Cube move's data",
         *STATED,
     ]
     assert "medians of 5 rounds of 10 updates" in printed

@@ -35,7 +35,7 @@ class Training(Settings):
         video_interval: Updates between two open-loop prediction videos; 0 for none.
         goals: Goals of the sampled sequences: ``"uniform"`` draws a fresh one for each, ``"stored"`` keeps those of the
             dataset, ``"auto"`` keeps them if the images show them (``virtual_target``), and draws them otherwise.
-        compile: Compile the update, which takes minutes and PyTorch 2.12 or newer; ``None`` does not.
+        compile: Compile the update. This takes minutes and needs PyTorch 2.12 or newer; ``None`` does not compile.
         cudagraph: Capture the update in a CUDA graph; ``None`` does so on a GPU.
         mixed_precision: Products and convolutions in bfloat16. Faster where the device has instructions for it, and the
             model is not small.

@@ -12,4 +12,4 @@ here=docs/results/gpu speed="python benchmarks/update_speed.py --device cuda --r
 python benchmarks/sampling_share.py --agent focus_lcp --device cuda --no-compile --rounds 5 >$here/sampling_share.txt
 timeout -s INT "${SECONDS_AT_MOST:-3600}" \
   ocwm train agent=focus_pcp env=cube_move size=cpu dataset="$1" output=outputs/gpu training.device=cuda training.compile=false \
-  training.seed=2 training.updates=15000 training.eval_interval=0 training.video_interval=0
+  training.seed=2 training.updates=15000 training.eval_interval=0 training.video_interval=0 2>&1 | tr '\r' '\n' | tail -n 3 >$here/train.txt
