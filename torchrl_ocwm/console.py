@@ -17,6 +17,7 @@ COMMANDS = {
     "collect": ("collect", "Collect a dataset."),
     "train": ("train_offline", "Train an agent on a dataset."),
     "train-online": ("train_online", "Train an agent that collects its data."),
+    "draw-targets": ("draw_targets", "Copy a dataset, with its goals in its images."),
     "import": ("import_data", "Make a dataset of recordings in the formats of others."),
     "export": ("export_data", "Write a dataset in a format of others."),
     "evaluate": ("evaluate", "Score agents on a grid of goals; tables, pictures, videos."),

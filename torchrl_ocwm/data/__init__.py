@@ -3,6 +3,7 @@
 from torchrl_ocwm.data.collect import CollectionError, collect, with_coverage
 from torchrl_ocwm.data.coverage import Coverage, coverage_curve, dataset_coverage, object_coverage, object_positions
 from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
+from torchrl_ocwm.data.drawn_targets import draw_targets
 from torchrl_ocwm.data.exporting import export_dataset
 from torchrl_ocwm.data.formats import SourceError
 from torchrl_ocwm.data.importing import Importing, Keys, import_dataset
@@ -30,6 +31,7 @@ __all__ = [
     "collect",
     "coverage_curve",
     "dataset_coverage",
+    "draw_targets",
     "episode_to_records",
     "export_dataset",
     "import_dataset",

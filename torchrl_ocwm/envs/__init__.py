@@ -31,6 +31,7 @@ from torchrl_ocwm.envs.registry import (
 from torchrl_ocwm.envs.sam2_masks import SAM2Masks
 from torchrl_ocwm.envs.scripted import ScriptedAction
 from torchrl_ocwm.envs.task import ActionRange, Task
+from torchrl_ocwm.envs.virtual_target import DrawTarget
 from torchrl_ocwm.envs.workspace import Workspace
 from torchrl_ocwm.lazy import lazily
 
@@ -53,6 +54,7 @@ __all__ = [
     "ColourMasks",
     "CubeLift",
     "CubeMove",
+    "DrawTarget",
     "EnvChoice",
     "EnvOptions",
     "Frame",

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.envs import Transform
+
+from torchrl_ocwm.envs.keys import read
 
 TARGET_COLOUR = (230, 40, 40)
 
@@ -33,3 +41,50 @@ def draw_target(pixels: np.ndarray, centre: np.ndarray, diameter: float, *, behi
     disc = (distance <= diameter / 2) | (distance == distance.min())
     pixels[disc & ~behind] = TARGET_COLOUR
     return pixels
+
+
+class DrawTarget(Transform):
+    """Draw a disc at the goal into images that do not show it: ``pixels``, ``masks``, ``goal_position`` → ``pixels``.
+
+    What the environments' option ``virtual_target`` does while they are played, for frames that are there already
+    (:func:`~torchrl_ocwm.data.draw_targets`). Objects hide the disc. The camera must not move.
+
+    Args:
+        project: Where positions ``[N, D]``, metres, are in the image: ``[N, 2]`` as (column, row); an environment's
+            :meth:`~torchrl_ocwm.envs.PositioningEnv.project`.
+        diameter: Pixels.
+        pixels: Key of the images, ``[N, 3, H, W]`` uint8, and of those that are written.
+        masks: Key of the masks, ``[N, O, H, W]`` bool.
+        goal_position: Key of the goals, ``[N, D]`` metres.
+
+    Raises:
+        KeyError: if there are no images, masks or goals.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> frames = TensorDict({"pixels": torch.zeros(2, 3, 8, 8, dtype=torch.uint8),
+        ...     "masks": torch.zeros(2, 1, 8, 8, dtype=torch.bool), "goal_position": torch.tensor([[1.5, 2.5]] * 2)}, [2])
+        >>> DrawTarget(lambda position: position, 1)(frames)["pixels"][1, 0].nonzero()
+        tensor([[2, 1]])
+    """
+
+    def __init__(
+        self,
+        project: Callable[[np.ndarray], np.ndarray],
+        diameter: float,
+        *,
+        pixels: NestedKey = "pixels",
+        masks: NestedKey = "masks",
+        goal_position: NestedKey = "goal_position",
+    ) -> None:
+        super().__init__(in_keys=[pixels, masks, goal_position], out_keys=[pixels])
+        self.project, self.diameter = project, diameter
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Draw into a copy of the images of frames ``[N]``."""
+        pixels, masks, goals = (read(self, tensordict, key) for key in self.in_keys)
+        images = pixels.movedim(1, -1).numpy(force=True).copy()
+        hidden = masks.any(1).numpy(force=True)
+        for image, centre, behind in zip(images, self.project(goals.numpy(force=True)), hidden, strict=True):
+            draw_target(image, centre, self.diameter, behind=behind)
+        return tensordict.set(self.out_keys[0], torch.from_numpy(images).movedim(-1, 1).contiguous().to(pixels.device))

@@ -13,11 +13,11 @@ from typing import Any
 import torch
 
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
-from torchrl_ocwm.envs import Task, make_env, make_task
+from torchrl_ocwm.envs import DrawTarget, Task, make_env, make_task
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs
 from torchrl_ocwm.evidence.queue import to_do
 from torchrl_ocwm.evidence.records import RECORD, Record
-from torchrl_ocwm.evidence.runs import Collected, Data, Evaluated, Explored, Run, Trained
+from torchrl_ocwm.evidence.runs import Collected, Data, Drawn, Evaluated, Explored, Run, Trained
 from torchrl_ocwm.evidence.settings import Machine
 from torchrl_ocwm.origin import machine
 from torchrl_ocwm.settings import change
@@ -118,6 +118,8 @@ class Paces:
     def _measure(self, run: Run) -> float:
         if isinstance(run, Collected):
             return seconds_of_a_step(run)
+        if isinstance(run, Drawn):
+            return seconds_of_a_drawing(make_task(run.env, **run.options))
         if isinstance(run, Explored):
             agent = _agent(make_task(run.env, **run.options), run.explorer, run.size)
             return seconds_of_a_step(run) + run.updates / run.steps * seconds_of_an_update(agent, self.how)
@@ -152,6 +154,13 @@ def seconds_of_a_step(run: Data) -> float:
     with closing(make_env(run.env, **run.options)) as env:
         env.rollout(1)
         return _seconds(lambda: env.rollout(_STEPS), _STEPS)
+
+
+def seconds_of_a_drawing(task: Task) -> float:
+    """Of a target in the image of a frame."""
+    frames = random_records(task, 1, _STEPS)[0]["next"]
+    draw = DrawTarget(lambda goals: goals[:, :2], 5)
+    return _seconds(lambda: draw(frames), _STEPS)
 
 
 def seconds_of_acting(agent: Agent) -> float:

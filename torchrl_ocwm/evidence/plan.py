@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torchrl_ocwm.evidence.figures import FIGURES, Row
 from torchrl_ocwm.evidence.options import all_options
-from torchrl_ocwm.evidence.runs import Collected, Data, Evaluated, Explored, Trained
+from torchrl_ocwm.evidence.runs import Collected, Data, Drawn, Evaluated, Explored, Trained
 from torchrl_ocwm.evidence.settings import Evidence
 from torchrl_ocwm.evidence.setups import BUDGETS, SETUPS, Budget, Setup
 from torchrl_ocwm.settings import SettingsError
@@ -74,6 +74,10 @@ def _evaluated(row: Row, env: str, seed: int, wanted: Evidence) -> Evaluated:
 
 
 def _data(row: Row, env: str, steps: int, setup: Setup, budget: Budget, size: str) -> Data:
+    if setup.acting and "virtual_target" in row.options:
+        # Who acts would act otherwise if it saw the target, and rows would differ by their episodes too.
+        plain = _data(replace(row, options={}), env, steps, setup, budget, size)
+        return Drawn(env=env, options={**plain.options, **row.options}, plain=plain)
     small = setup.small if budget.small else {}
     options = {**setup.options, **small, **budget.options, **row.options}
     if row.data in ("random", "scripted"):

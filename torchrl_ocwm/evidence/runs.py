@@ -247,6 +247,51 @@ class Explored(Data):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Drawn(Data):
+    """The episodes of another dataset, with their goals in the images: agents with and without see the same.
+
+    Args:
+        plain: The other dataset. Environment and seed are its own; the options say how large the target is.
+    """
+
+    plain: Data
+
+    @property
+    def prefix(self) -> str:
+        """That of the other dataset."""
+        return f"{self.plain.prefix}-target"
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """The other dataset, and the target."""
+        return {"plain": self.plain.content, "virtual_target": self._diameter}
+
+    @property
+    def _diameter(self) -> int:
+        return self.options["virtual_target"]
+
+    @property
+    def work(self) -> int:
+        """Steps."""
+        return self.plain.work
+
+    @property
+    def pace(self) -> str:
+        """Simulator and image."""
+        return f"draw {self.env} {image_size(self.env, self.options)}"
+
+    @property
+    def needs(self) -> tuple[Run, ...]:
+        """The other dataset."""
+        return (self.plain,)
+
+    def commands(self, root: Path, machine: Machine) -> list[Command]:  # noqa: ARG002
+        """``ocwm draw-targets``."""
+        paths = override("dataset", self.plain.dataset(root)), override("destination", self.dataset(root))
+        return [("draw-targets", *paths, f"diameter={self._diameter}")]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Trained(Run):
     """An agent that has learnt from a dataset.
 
