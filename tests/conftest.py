@@ -31,6 +31,7 @@ REQUIRED = {
     "diagnose": ["checkpoint=a.zip", "dataset=data"],
     "reproduce": ["figure=table"],
     "share": ["evaluation=there"],
+    "draw_targets": ["dataset=data", "destination=out"],
     "import_data": ["source=there"],
     "export_data": ["dataset=data", "format=npz", "destination=out"],
 }

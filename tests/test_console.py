@@ -117,7 +117,8 @@ def test_each_command_has_its_recipe(
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["ocwm", "--cfg", "job"])
     console.run(command)
-    of_its_own = {"collect": "dataset: data/", "import": "source: ", "export": "destination: ", "play": "port: "}
+    of_its_own = {"collect": "dataset: data/", "import": "source: ", "play": "port: "}
+    of_its_own |= dict.fromkeys(("export", "draw-targets"), "destination: ")
     assert of_its_own.get(command, "output: outputs/") in capsys.readouterr().out
 
 

@@ -12,6 +12,7 @@ import torch
 from torchrl_ocwm.agents import build_agent
 from torchrl_ocwm.evidence import (
     Collected,
+    Drawn,
     Evaluated,
     Explored,
     Machine,
@@ -86,7 +87,8 @@ def test_a_short_timing(agent: str, tmp_path: Path) -> None:
     trained = replace(TRAINED, agent=agent)
     explored = Explored(env="reacher", options=TINY, explorer="plan2explore", size="debug", steps=100)
     paces = Paces(tmp_path, Machine())
-    for run in (DATA, explored, trained, replace(EVALUATED, trained=trained)):
+    drawn = Drawn(env="reacher", options={**TINY, "virtual_target": 5}, plain=DATA)
+    for run in (DATA, drawn, explored, trained, replace(EVALUATED, trained=trained)):
         start = time.perf_counter()
         pace = paces[run]
         took = time.perf_counter() - start  # however busy the machine is

@@ -15,8 +15,11 @@ from torchrl_ocwm.evidence import (
     BUDGETS,
     FIGURES,
     SETUPS,
+    Collected,
+    Drawn,
     Evaluated,
     Evidence,
+    Explored,
     Machine,
     Run,
     Trained,
@@ -63,7 +66,8 @@ def test_what_a_figure_needs(figure: str, datasets: int, trainings: int, size: s
     assert count(runs(figure, size=size)) == one
     more = runs(figure, size=size, seeds=3, env=("reacher", "cube_move"))
     trained = {"trainings": 6 * trainings, "evaluations": 6 * trainings}
-    assert count(more) == {"datasets": 2 * datasets, **trained}  # all seeds learn from the same data
+    drawn_into = figure == "target_size"  # the episodes that Cube move's targets are drawn into, which no row sees
+    assert count(more) == {"datasets": 2 * datasets + drawn_into, **trained}  # all seeds learn from the same data
 
 
 @pytest.mark.parametrize(
@@ -115,6 +119,11 @@ def test_commands_say_what_runs_are(compose: Callable[..., Any]) -> None:
         for command, *arguments in run.commands(ROOT, Machine(threads=3)):
             config, content = compose(COMMANDS[command][0], *arguments), run.content
             assert not isinstance(config, str), config
+            if command == "draw-targets":
+                assert config.dataset == str(ROOT / run.needs[0].name / "data")
+                assert config.destination == str(ROOT / run.name / "data")
+                assert config.diameter == content["virtual_target"]
+                continue
             if command == "evaluate":
                 assert config.checkpoint == str(ROOT / run.needs[0].name / "checkpoint.zip")
                 asked = ("goals", "episode_steps", "image_goals", "random", "seed")
@@ -135,6 +144,20 @@ def test_commands_say_what_runs_are(compose: Callable[..., Any]) -> None:
                 assert (config.agent, config.size) == (content["agent"], content["size"])
                 assert config.online == content["online"]
                 assert config.training.updates == run.updates
+
+
+def test_with_and_without_a_target_agents_learn_from_the_same_episodes() -> None:
+    """Policies that do not look collect the same ones again; an agent that acts would see the target."""
+    for env, kinds in (("reacher", [Collected] * 4), ("cube_move", [Explored, Drawn] * 2)):
+        with_and_without = [run.data for run in runs("limits", env=env) if isinstance(run, Trained)][:4]
+        assert [type(data) for data in with_and_without] == kinds
+        for plain, shown in (with_and_without[:2], with_and_without[2:]):
+            assert plain.options["horizon"] == shown.options["horizon"] == 100
+            assert (plain.options.get("virtual_target", 0), shown.options["virtual_target"]) == (0, 5)
+            if isinstance(shown, Drawn):
+                assert shown.needs == (plain,)
+            else:
+                assert (plain.content["policies"], plain.seed) == (shown.content["policies"], shown.seed)
 
 
 def test_a_dataset_of_several_policies_is_collected_in_their_shares(compose: Callable[..., Any]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from torchrl_ocwm.agents import AGENTS, SIZES
-from torchrl_ocwm.evidence import Collected, Evaluated, Explored, Record, RecordError, Trained
+from torchrl_ocwm.evidence import Collected, Drawn, Evaluated, Explored, Record, RecordError, Trained
 from torchrl_ocwm.settings import Settings, change, to_dict
 from torchrl_ocwm.testing import random_dataset, reacher_task
 
@@ -117,6 +117,16 @@ def test_a_default_that_has_changed_is_noticed(tmp_path: Path) -> None:
     file.write_text("{}")
     with pytest.raises(RecordError, match="run.json: not the record of a run"):
         Record.of(TRAINED, tmp_path)
+
+
+def test_a_copy_with_targets_is_known_by_what_it_is_of_and_their_size() -> None:
+    drawn = Drawn(env="reacher", options={**DATA.options, "virtual_target": 5}, plain=DATA)
+    assert drawn.name.startswith("datasets/reacher-scripted-random-target-")
+    for other in ({"options": {**DATA.options, "virtual_target": 6}}, {"plain": replace(DATA, seed=1)}):
+        assert replace(drawn, **other).name != drawn.name
+    assert replace(TRAINED, data=drawn).name != TRAINED.name
+    assert (drawn.work, drawn.needs) == (40, (DATA,))
+    assert drawn.pace != DATA.pace
 
 
 def test_how_far_a_run_is(tmp_path: Path) -> None:

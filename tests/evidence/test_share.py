@@ -16,7 +16,7 @@ from torchrl_ocwm.agents import build_agent
 from torchrl_ocwm.data import Collection, collect
 from torchrl_ocwm.envs import make_task
 from torchrl_ocwm.evaluation import Report
-from torchrl_ocwm.evidence import Collected, Data, Evaluated, Explored, Record, RecordError, Trained, share
+from torchrl_ocwm.evidence import Collected, Data, Drawn, Evaluated, Explored, Record, RecordError, Trained, share
 from torchrl_ocwm.testing import reacher_task
 
 COLLECTED = Collected(env="reacher", options={"image_size": 16}, policies={"scripted": 30, "random": 12})
@@ -72,6 +72,13 @@ def test_card_of_data_of_an_agent(tmp_path: Path, more: dict[str, Any], said: st
     data = Explored(env="reacher", options=options, explorer="focus_pcp", size="debug", steps=2_000, **more)
     card = (share(make_evaluated(tmp_path, data), tmp_path / "shared") / "README.md").read_text()
     assert f"| data | {said} of an agent that learnt meanwhile, seed 0 |" in card
+
+
+def test_card_of_data_with_their_goals_in_the_images(tmp_path: Path) -> None:
+    data = Drawn(env="reacher", options={**COLLECTED.options, "virtual_target": 5}, plain=replace(COLLECTED, seed=4))
+    card = (share(make_evaluated(tmp_path, data), tmp_path / "shared") / "README.md").read_text()
+    said = "30 scripted steps and 12 random steps, with goals of 5 pixels in the images, seed 4"
+    assert f"| data | {said} |" in card
 
 
 def test_runs_may_have_been_moved(evaluated: Path, tmp_path: Path) -> None:

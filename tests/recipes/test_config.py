@@ -373,6 +373,7 @@ class TestHydra:
         ("collect", []),
         ("evaluate", ["checkpoint"]),
         ("diagnose", ["checkpoint", "dataset"]),
+        ("draw_targets", ["dataset", "destination"]),
         ("import_data", ["source"]),
         ("export_data", ["dataset", "format", "destination"]),
         ("share", ["evaluation"]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ from torchrl_ocwm.data import Collection, collect
 from torchrl_ocwm.data.dataset import EpisodeDataset
 from torchrl_ocwm.envs import ENVIRONMENTS, PositioningEnv, make_env, make_task
 from torchrl_ocwm.envs.virtual_target import TARGET_COLOUR
+from torchrl_ocwm.recipes import draw_targets
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import reacher_task
 
@@ -78,6 +80,19 @@ def test_virtual_target() -> None:
             if diameter:
                 goal = scene.project(np.array([[0.1, 0.1]]))[0]
                 assert np.hypot(columns.mean() + 0.5 - goal[0], rows.mean() + 0.5 - goal[1]) < 1
+
+
+@shows("DrawTargets.dataset", "DrawTargets.destination", "DrawTargets.diameter")
+def test_targets_in_a_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = collect(tmp_path / "plain", "reacher", 5, options={"horizon": 5}, workers=0, progress=False)
+    areas = []
+    for diameter in (6, 12):
+        copy = f"destination={tmp_path / str(diameter)}"
+        monkeypatch.setattr(sys, "argv", ["ocwm", f"dataset={plain.path}", copy, f"diameter={diameter}"])
+        draw_targets.main()
+        pixels = EpisodeDataset.open(tmp_path / str(diameter))[0]["next", "pixels"][0]
+        areas.append(int((pixels == torch.tensor(TARGET_COLOUR).view(3, 1, 1)).all(0).sum()))
+    assert areas == pytest.approx([np.pi * 9, np.pi * 36], rel=0.2)
 
 
 @shows("EnvOptions.labelled_frames")

@@ -62,10 +62,13 @@ class DrawTarget(Transform):
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> frames = TensorDict({"pixels": torch.zeros(2, 3, 8, 8, dtype=torch.uint8),
-        ...     "masks": torch.zeros(2, 1, 8, 8, dtype=torch.bool), "goal_position": torch.tensor([[1.5, 2.5]] * 2)}, [2])
+        >>> frames = TensorDict({
+        ...     "pixels": torch.zeros(2, 3, 8, 8, dtype=torch.uint8),
+        ...     "masks": torch.zeros(2, 1, 8, 8, dtype=torch.bool),
+        ...     "goal_position": torch.tensor([[1.5, 2.5], [3.5, 2.5]]),
+        ... }, [2])
         >>> DrawTarget(lambda position: position, 1)(frames)["pixels"][1, 0].nonzero()
-        tensor([[2, 1]])
+        tensor([[2, 3]])
     """
 
     def __init__(

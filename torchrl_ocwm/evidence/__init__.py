@@ -11,7 +11,7 @@ from torchrl_ocwm.evidence.page import write_page
 from torchrl_ocwm.evidence.plan import Result, results
 from torchrl_ocwm.evidence.queue import RunFailedError, in_order, to_do, work_off
 from torchrl_ocwm.evidence.records import Record, RecordError
-from torchrl_ocwm.evidence.runs import Collected, Data, Evaluated, Explored, Run, Trained
+from torchrl_ocwm.evidence.runs import Collected, Data, Drawn, Evaluated, Explored, Run, Trained
 from torchrl_ocwm.evidence.settings import Evidence, Machine
 from torchrl_ocwm.evidence.setups import BUDGETS, SETUPS, Budget, Setup
 from torchrl_ocwm.evidence.share import share
@@ -24,6 +24,7 @@ __all__ = [
     "Budget",
     "Collected",
     "Data",
+    "Drawn",
     "Evaluated",
     "Evidence",
     "Explored",

@@ -62,8 +62,9 @@ def _of_reproduce(evaluation: Path) -> tuple[Path, dict[str, str]]:
     else:
         raise RecordError(f"{evaluation}: its training is not in {evaluation.parents[1] / 'trainings'}")
     data, training = trained.content["data"], trained.content["training"]
+    seed = data.get("plain", data)["seed"]
     return folder / CHECKPOINT, {
-        "data": f"{_steps(data)}, seed {data['seed']}",
+        "data": f"{_steps(data)}, seed {seed}",
         "training": f"{training['updates']:,} updates, seed {training['seed']}, {in_words(trained.seconds)}",
         "machine": trained.machine,
         "commit": f"{trained.commit}, evaluated at {record.commit}",
@@ -72,6 +73,8 @@ def _of_reproduce(evaluation: Path) -> tuple[Path, dict[str, str]]:
 
 def _steps(data: dict[str, Any]) -> str:
     """Whose the steps of a dataset are: of policies, and of an agent that learnt meanwhile."""
+    if "plain" in data:
+        return f"{_steps(data['plain'])}, with goals of {data['virtual_target']} pixels in the images"
     if "policies" in data:
         return _in_words(data["policies"])
     online = data["online"]
