@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, collect, draw_targets, drawn_targets
-from torchrl_ocwm.envs import DrawTarget
+from torchrl_ocwm.envs import DrawTarget, find_environment, make_env, make_scene
 from torchrl_ocwm.envs.virtual_target import TARGET_COLOUR
 
 OPTIONS = {"image_size": 24, "horizon": 10}
@@ -70,6 +71,32 @@ def test_what_cannot_have_targets(plain: EpisodeDataset, tmp_path: Path, monkeyp
     with pytest.raises(DatasetError, match="'reacher' does not say where goals are in its images"):
         draw_targets(plain, tmp_path / "out", 5)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_it_draws_while_an_environment_is_played(num_envs: int) -> None:
+    """As the environment's own option does, at each reset and each step."""
+    images = []
+    with closing(make_scene(find_environment("reacher"), **OPTIONS)) as scene:
+        plain = make_env("reacher", num_envs=num_envs, **OPTIONS)
+        shown = make_env("reacher", num_envs=num_envs, virtual_target=4, **OPTIONS)
+        for env in (plain.append_transform(DrawTarget(scene.project, 4)), shown):
+            env.set_seed(0)
+            torch.manual_seed(0)
+            rollout = env.rollout(3)
+            images.append(torch.stack([rollout["pixels"], rollout["next", "pixels"]]))
+            env.close()
+    assert torch.equal(*images)
+    assert (images[0] == torch.tensor(TARGET_COLOUR).view(3, 1, 1)).all(-3).flatten(-2).any(-1).all()
+
+
+def test_sequences_of_a_batch() -> None:
+    """Each sequence has its own goal, and each frame."""
+    goals = torch.arange(6.0).view(2, 3, 1).expand(2, 3, 2)
+    frames = {"pixels": torch.zeros(2, 3, 3, 8, 8, dtype=torch.uint8), "masks": torch.zeros(2, 3, 1, 8, 8).bool()}
+    drawn = DrawTarget(lambda position: position + 0.5, 1)(TensorDict({**frames, "goal_position": goals}, [2, 3]))
+    places = (drawn["pixels"][:, :, 0] > 0).flatten(-2).nonzero()
+    assert places.tolist() == [[n // 3, n % 3, 9 * n] for n in range(6)]
 
 
 def test_frames_of_other_keys_and_what_hides_the_disc() -> None:

@@ -46,16 +46,17 @@ def draw_target(pixels: np.ndarray, centre: np.ndarray, diameter: float, *, behi
 class DrawTarget(Transform):
     """Draw a disc at the goal into images that do not show it: ``pixels``, ``masks``, ``goal_position`` → ``pixels``.
 
-    What the environments' option ``virtual_target`` does while they are played, for frames that are there already
-    (:func:`~torchrl_ocwm.data.draw_targets`). Objects hide the disc. The camera must not move.
+    What the option ``virtual_target`` does in this package's environments, for any other, for a replay buffer, and for
+    frames that are there already (:func:`~torchrl_ocwm.data.draw_targets`). Objects hide the disc. The camera must not
+    move.
 
     Args:
         project: Where positions ``[N, D]``, metres, are in the image: ``[N, 2]`` as (column, row); an environment's
             :meth:`~torchrl_ocwm.envs.PositioningEnv.project`.
         diameter: Pixels.
-        pixels: Key of the images, ``[N, 3, H, W]`` uint8, and of those that are written.
-        masks: Key of the masks, ``[N, O, H, W]`` bool.
-        goal_position: Key of the goals, ``[N, D]`` metres.
+        pixels: Key of the images, ``[..., 3, H, W]`` uint8, and of those that are written.
+        masks: Key of the masks, ``[..., O, H, W]`` bool.
+        goal_position: Key of the goals, ``[..., D]`` metres.
 
     Raises:
         KeyError: if there are no images, masks or goals.
@@ -83,11 +84,20 @@ class DrawTarget(Transform):
         super().__init__(in_keys=[pixels, masks, goal_position], out_keys=[pixels])
         self.project, self.diameter = project, diameter
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Draw into a copy of the images of frames ``[N]``."""
-        pixels, masks, goals = (read(self, tensordict, key) for key in self.in_keys)
-        images = pixels.movedim(1, -1).numpy(force=True).copy()
-        hidden = masks.any(1).numpy(force=True)
-        for image, centre, behind in zip(images, self.project(goals.numpy(force=True)), hidden, strict=True):
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        pixels, masks, goals = (read(self, next_tensordict, key) for key in self.in_keys)
+        size = pixels.shape[-2:]
+        images = pixels.movedim(-3, -1).reshape(-1, *size, 3).numpy(force=True).copy()
+        hidden = masks.any(-3).reshape(-1, *size).numpy(force=True)
+        centres = self.project(goals.reshape(-1, goals.shape[-1]).numpy(force=True))
+        for image, centre, behind in zip(images, centres, hidden, strict=True):
             draw_target(image, centre, self.diameter, behind=behind)
-        return tensordict.set(self.out_keys[0], torch.from_numpy(images).movedim(-1, 1).contiguous().to(pixels.device))
+        drawn = torch.from_numpy(images).movedim(-1, -3).reshape(pixels.shape).contiguous().to(pixels.device)
+        return next_tensordict.set(self.out_keys[0], drawn)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Draw into a copy of the images of frames."""
+        return self._call(tensordict)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
+        return self._call(tensordict_reset)
