@@ -50,3 +50,15 @@ def test_cube_move_on_the_same_data_in_the_readme() -> None:
         assert f"`{agent}` {light} with weights of 1 and {heavy} with 200, " in text
     assert f"random actions {scores['random']} ([all of it]" in text
     assert set(seeds.values()) == {2}
+
+
+def test_goals_as_images_on_cube_move_in_the_readme() -> None:
+    found = report("figures/visual_goals-cube_move-cpu/cube_move")
+    cosine, temporal, lcp = (
+        cell(found, f"{row}, image goals", "final_score") for row in ("lexa_cosine", "lexa_temporal", "focus_lcp")
+    )
+    text = " ".join((ROOT / "README.md").read_text().split())
+    said = f"`lexa_cosine` has {cosine}, `lexa_temporal` {temporal} and `focus_lcp` {lcp} ([goals as images]"
+    assert f"With goals as images and one of these seeds, {said}" in text
+    in_the_table = report("figures/table-cube_move-cpu/cube_move").rows["focus_lcp"].runs
+    assert set(found.rows["focus_lcp"].runs) < set(in_the_table)
