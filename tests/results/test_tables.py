@@ -18,13 +18,20 @@ def test_tables_are_those_of_the_numbers(name: str) -> None:
         assert table in (RESULTS / name / "README.md").read_text()
 
 
+SAME_DATA, IMAGES = "figures/table-cube_move-cpu/cube_move", "figures/visual_goals-cube_move-cpu/cube_move"
+
+
 def test_tables_of_the_readme() -> None:
     text = (ROOT / "README.md").read_text()
-    for name in ("reacher", "cube_move"):
-        for agent in report(name).rows:
-            shown = f"`{agent}`".replace(", image goals`", "`, goals as images").replace("`random`", "random actions")
+    for name in ("reacher", SAME_DATA, IMAGES):
+        rows = [agent for agent in report(name).rows if name != IMAGES or agent.startswith("lexa")]
+        assert rows
+        for agent in rows:
+            row, _, how = agent.partition(", ")
+            kind = f", {how.replace('image goals', 'goals as images')}" if how else ""
+            shown = "random actions" if row == "random" else f"`{row}`{kind}"
             score = cell(report(name), agent, "final_score")
-            assert re.search(rf"^\| {shown}(, 7,500 updates.*)? \| {score} \|$", text, re.MULTILINE), (name, agent)
+            assert re.search(rf"^\| {shown} \| {score} \|$", text, re.MULTILINE), (name, agent)
 
 
 def test_the_stronger_baselines_in_the_readme() -> None:
@@ -37,28 +44,18 @@ def test_the_stronger_baselines_in_the_readme() -> None:
     assert len(found.rows["focus_lcp"].runs) == 3
 
 
-def test_cube_move_on_the_same_data_in_the_readme() -> None:
-    found = report("figures/table-cube_move-cpu/cube_move")
-    scores = {row: cell(found, row, "final_score") for row in found.rows}
-    assert len(found.goals) == 100
+def test_how_the_agents_of_cube_move_were_scored() -> None:
+    found, images = report(SAME_DATA), report(IMAGES)
     text = " ".join((ROOT / "README.md").read_text().split())
-    seeds = {row: len(found.rows[row].seeds) for row in found.rows}
-    assert f"`focus_lcp` scores {scores['focus_lcp']}, with images {scores['focus_lcp, image goals']}, " in text
-    assert f"`focus_pcp` {scores['focus_pcp']}, `dreamer_pcp` {scores['dreamer_pcp']}, " in text
-    for agent in ("focus", "dreamer"):
-        light, heavy = (scores[f"{agent}, weights {weight}"] for weight in (1, 200))
-        assert f"`{agent}` {light} with weights of 1 and {heavy} with 200, " in text
-    assert f"random actions {scores['random']} ([all of it]" in text
-    assert set(seeds.values()) == {2}
+    assert f"{len(found.goals)} goals, two seeds, 15,000 updates, LEXA with one seed." in text
+    assert {len(row.seeds) for row in found.rows.values()} == {2}
+    assert {len(images.rows[f"lexa_{kind}, image goals"].seeds) for kind in ("cosine", "temporal")} == {1}
+    assert set(images.rows["focus_lcp"].runs) < set(found.rows["focus_lcp"].runs)  # of the same data
 
 
-def test_goals_as_images_on_cube_move_in_the_readme() -> None:
-    found = report("figures/visual_goals-cube_move-cpu/cube_move")
-    cosine, temporal, lcp = (
-        cell(found, f"{row}, image goals", "final_score") for row in ("lexa_cosine", "lexa_temporal", "focus_lcp")
-    )
+def test_cube_move_in_turns_in_the_readme() -> None:
+    found = report("cube_move")
+    pcp, lcp, images = (cell(found, row, "final_score") for row in ("focus_pcp", "focus_lcp", "focus_lcp, image goals"))
     text = " ".join((ROOT / "README.md").read_text().split())
-    said = f"`lexa_cosine` has {cosine}, `lexa_temporal` {temporal} and `focus_lcp` {lcp} ([goals as images]"
-    assert f"With goals as images and one of these seeds, {said}" in text
-    in_the_table = report("figures/table-cube_move-cpu/cube_move").rows["focus_lcp"].runs
-    assert set(found.rows["focus_lcp"].runs) < set(in_the_table)
+    assert f"on {len(found.goals)} goals and with one seed. In turns with acting, " in text
+    assert f"acting, `focus_pcp` scores {pcp}, `focus_lcp` {lcp}, with images {images} ([how" in text
