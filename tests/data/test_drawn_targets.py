@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from tensordict import TensorDict
 from torchrl_ocwm.data import DatasetError, EpisodeDataset, collect, draw_targets, drawn_targets
 from torchrl_ocwm.envs import DrawTarget, find_environment, make_env, make_scene
 from torchrl_ocwm.envs.virtual_target import TARGET_COLOUR
+from torchrl_ocwm.testing import random_dataset, reacher_task
 
 OPTIONS = {"image_size": 24, "horizon": 10}
 
@@ -67,6 +69,9 @@ def test_what_cannot_have_targets(plain: EpisodeDataset, tmp_path: Path, monkeyp
         unmasked.append(records)
     with pytest.raises(DatasetError, match="unmasked: holds no masks, which a disc at the goal needs"):
         draw_targets(unmasked, tmp_path / "out", 5)
+    recorded = random_dataset(tmp_path / "recorded", replace(reacher_task(16), name="my_arm"))
+    with pytest.raises(DatasetError, match="'my_arm' does not say where goals are in its images; transform_dataset"):
+        draw_targets(recorded, tmp_path / "out", 5)
     monkeypatch.setattr(drawn_targets, "make_scene", lambda *_, **__: SimpleNamespace(close=lambda: None))
     with pytest.raises(DatasetError, match="'reacher' does not say where goals are in its images"):
         draw_targets(plain, tmp_path / "out", 5)

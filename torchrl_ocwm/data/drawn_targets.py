@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -12,6 +13,9 @@ from torchrl_ocwm.data.dataset import DatasetError, EpisodeDataset
 from torchrl_ocwm.data.index import INDEX
 from torchrl_ocwm.data.transformed import transform_dataset
 from torchrl_ocwm.envs import DrawTarget, Task, environment_of, make_scene
+from torchrl_ocwm.settings import SettingsError
+
+_READ = ("pixels", "masks", "goal_position")
 
 
 def draw_targets(dataset: EpisodeDataset, path: str | Path, diameter: int) -> EpisodeDataset:
@@ -47,24 +51,44 @@ def draw_targets(dataset: EpisodeDataset, path: str | Path, diameter: int) -> Ep
     """
     if diameter < 1:
         raise ValueError(f"diameter must be at least 1 pixel, got {diameter}")
-    if dataset.images_show_goal:
-        raise DatasetError(f"{dataset.path}: its images show the goals of its episodes already (virtual_target)")
-    if lacking := [name for name in ("goal_position", "masks") if name not in dataset.records["next"].keys()]:
-        raise DatasetError(f"{dataset.path}: holds no {lacking[0]}, which a disc at the goal needs")
+    _check(dataset)
     shown = {"virtual_target": diameter}
     options = {**dataset.metadata.get("options", {}), **shown}
     task = replace(dataset.task, options={**dataset.task.options, **shown})
     if (Path(path) / INDEX).exists() and _is_of(made := EpisodeDataset.open(path), dataset, task):
         return made
-    with closing(make_scene(environment_of(dataset.task), **dataset.task.options)) as scene:
-        if not hasattr(scene, "project"):
-            raise DatasetError(f"{dataset.path}: {task.name!r} does not say where goals are in its images (project)")
-        keys = {name: ("next", name) for name in ("pixels", "masks", "goal_position")}
+    with closing(_scene(dataset)) as scene:
+        keys = {name: ("next", name) for name in _READ}
         draw = DrawTarget(scene.project, diameter, **keys)
         return transform_dataset(dataset, path, draw, options=options, task=task.to_dict())
 
 
+def _check(dataset: EpisodeDataset) -> None:
+    if dataset.images_show_goal:
+        raise DatasetError(f"{dataset.path}: its images show the goals of its episodes already (virtual_target)")
+    if lacking := [name for name in _READ if name not in dataset.records["next"].keys()]:
+        raise DatasetError(f"{dataset.path}: holds no {lacking[0]}, which a disc at the goal needs")
+
+
+def _scene(dataset: EpisodeDataset) -> Any:
+    """What knows where positions are in the images."""
+    unknown = (
+        f"{dataset.path}: {dataset.task.name!r} does not say where goals are in its images; transform_dataset with "
+        "DrawTarget(project, diameter) takes a projection of your own"
+    )
+    try:
+        environment = environment_of(dataset.task)
+    except SettingsError as error:
+        raise DatasetError(unknown) from error
+    scene = make_scene(environment, **dataset.task.options)
+    if not hasattr(scene, "project"):
+        scene.close()
+        raise DatasetError(unknown)
+    return scene
+
+
 def _is_of(copy: EpisodeDataset, dataset: EpisodeDataset, task: Task) -> bool:
     """Whether a dataset has the task of a copy, and the episodes of the other."""
-    goals = [one.records["next", "goal_position"] for one in (copy, dataset)]
-    return copy.task == task and copy.episode_lengths == dataset.episode_lengths and torch.equal(*goals)
+    if copy.task != task or copy.episode_lengths != dataset.episode_lengths:
+        return False
+    return torch.equal(*(one.records["next", "goal_position"] for one in (copy, dataset)))
