@@ -41,7 +41,7 @@ def scores() -> list[str]:
     ends = [mean(found, row, "final_distance", 100) for row in found.rows if not row.startswith("dreamer, weights 1,")]
     goal = [mean(found, f"dreamer, weights 1, {at}", "goal_error", 100) for at in ("no target", "virtual target")]
     return [
-        f"Dreamer with weights of 1 has {said[0]}, with weights of 200 {said[1]}. FOCUS",
+        f"Dreamer with weights of 1 has {said[0]}, with weights of 200 {said[1]}.",
         f"FOCUS with weights of 1 has {said[2]}, with weights of 200 {said[3]}.",
         f"two seeds of FOCUS with weights of 1 differ by {abs(one - other):.2f}",
         f"On average it ends {min(ends):.0f} to {max(ends):.0f} cm from the goal",
@@ -64,7 +64,7 @@ def known() -> list[str]:
     return [
         f"it predicts {disc[0]:.0%} of the variance, where it predicted {without[0]:.0%}",
         f"In the first step it knows where the cube is, to {100 * first[2]:.1f} cm. After 20 steps the cube is",
-        f"where it was, {100 * after[0]:.0f} cm from the goal, and Dreamer",
+        f"where it was, {100 * after[0]:.0f} cm from the goal, and",
         f"Dreamer believes that it is {100 * after[1]:.1f} cm from it",
         f"there it knows the cube to {100 * disc[1]:.1f} cm",
         "to 2 cm after 20 and after 100 steps",
