@@ -76,7 +76,8 @@ def _evaluated(row: Row, env: str, seed: int, wanted: Evidence) -> Evaluated:
 def _data(row: Row, env: str, steps: int, setup: Setup, budget: Budget, size: str) -> Data:
     if setup.acting and "virtual_target" in row.options:
         # Who acts would act otherwise if it saw the target, and rows would differ by their episodes too.
-        plain = _data(replace(row, options={}), env, steps, setup, budget, size)
+        others = {name: value for name, value in row.options.items() if name != "virtual_target"}
+        plain = _data(replace(row, options=others), env, steps, setup, budget, size)
         return Drawn(env=env, options={**plain.options, **row.options}, plain=plain)
     small = setup.small if budget.small else {}
     options = {**setup.options, **small, **budget.options, **row.options}
