@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -16,11 +17,13 @@ from torchrl_ocwm.evidence import (
     FIGURES,
     SETUPS,
     Collected,
+    Data,
     Drawn,
     Evaluated,
     Evidence,
     Explored,
     Machine,
+    Row,
     Run,
     Trained,
     in_order,
@@ -158,6 +161,15 @@ def test_with_and_without_a_target_agents_learn_from_the_same_episodes() -> None
                 assert shown.needs == (plain,)
             else:
                 assert (plain.content["policies"], plain.seed) == (shown.content["policies"], shown.seed)
+
+
+def test_the_episodes_without_a_target_have_the_other_options(monkeypatch: pytest.MonkeyPatch) -> None:
+    options = {"virtual_target": 3, "objects": ["cube", "distractor"]}
+    row = Row(name="two cubes", agent="dreamer", options=options)
+    monkeypatch.setitem(FIGURES, "limits", replace(FIGURES["limits"], rows=(row,)))
+    plain, shown = (run for run in runs("limits", env="cube_move") if isinstance(run, Data))
+    assert plain.options["objects"] == shown.options["objects"] == ["cube", "distractor"]
+    assert (plain.content["options"].virtual_target, shown.content["virtual_target"]) == (0, 3)
 
 
 def test_a_dataset_of_several_policies_is_collected_in_their_shares(compose: Callable[..., Any]) -> None:

@@ -66,7 +66,7 @@ def known() -> list[str]:
         f"In the first step it knows where the cube is, to {100 * first[2]:.1f} cm. After 20 steps the cube is",
         f"where it was, {100 * after[0]:.0f} cm from the goal, and",
         f"Dreamer believes that it is {100 * after[1]:.1f} cm from it",
-        f"there it knows the cube to {100 * disc[1]:.1f} cm",
+        f"On recorded frames it knows the cube to {100 * disc[1]:.1f} cm",
         "to 2 cm after 20 and after 100 steps",
     ]
 

@@ -21,8 +21,8 @@ _READ = ("pixels", "masks", "goal_position")
 def draw_targets(dataset: EpisodeDataset, path: str | Path, diameter: int) -> EpisodeDataset:
     """Copy a dataset, with a disc at the goal of each episode in its images (paper, "Size matters!").
 
-    So agents that see their goal and agents that do not learn from the same episodes. The copy is what would have been
-    recorded with the option ``virtual_target``, if nobody who acted had looked at the disc.
+    Agents that see their goal, and others that do not, can then learn from the same episodes. The copy is what
+    would have been recorded with the option ``virtual_target``, if nobody who acted had looked at the disc.
 
     A copy that is there already is opened.
 
