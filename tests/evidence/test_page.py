@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
@@ -158,6 +159,15 @@ def test_the_page_of_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert means == pytest.approx({"1": 0.2, "10": 0.3, "100": 0.2, "1000": 0.3})
     assert drawn["goal reconstruction error, m"]["dreamer"]["1"][0] == pytest.approx(0.8)
     assert set(drawn["success within 5 cm"]["dreamer"].values()) == {None}
+
+
+def test_its_command_can_be_typed(tmp_path: Path) -> None:
+    """A shell takes it apart as it was meant, whatever signs the names of rows have."""
+    wanted = Evidence(figure="loss_scale", size="debug", agents=("dreamer, goal weight 10",))
+    text = write_page(wanted, results(wanted), tmp_path).read_text()
+    (command,) = (line for line in text.splitlines() if line.startswith("ocwm"))
+    seen = subprocess.run(["sh", "-c", f"printf '%s\n' {command}"], capture_output=True, text=True, check=True)
+    assert 'agents=["dreamer, goal weight 10"]' in seen.stdout.splitlines()
 
 
 def test_random_actions_have_as_many_seeds(tmp_path: Path) -> None:

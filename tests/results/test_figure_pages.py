@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,7 @@ def test_runs_are_those_of_the_command_today(page: Path) -> None:
     """
     text = page.read_text(encoding="utf-8")
     (command,) = re.findall(r"^ocwm reproduce (.+)$", text, re.MULTILINE)
-    given = {name: yaml.safe_load(value) for name, value in (setting.split("=") for setting in command.split())}
+    given = {name: yaml.safe_load(value) for name, value in (setting.split("=") for setting in shlex.split(command))}
     wanted = from_dict(Evidence, given)
     runs = in_order(one.evaluated for one in results(wanted))
     missing = {run.name for run in runs} ^ set(json.loads((page.parent / RUNS).read_text(encoding="utf-8")))

@@ -70,7 +70,15 @@ def test_rows_of_some_agents(reproduce: Callable[..., SimpleNamespace]) -> None:
     wanted, found, _ = seen.page
     assert [one.row.name for one in found] == ["dreamer, weights 1", "dreamer, weights 200", "focus_lcp"]
     assert wanted.agents == ("focus_lcp", "dreamer")
-    assert "agents must be of those of figure=loss_scale, dreamer; got 'focus'" in reproduce("agents=[focus]").said
+    said = reproduce("agents=[focus]").said
+    assert "agents must be agents or rows of figure=loss_scale: dreamer; dreamer, goal weight 1;" in said
+    assert "Got 'focus'" in said
+
+
+@shows("Evidence.agents")
+def test_rows_by_name(reproduce: Callable[..., SimpleNamespace]) -> None:
+    seen = reproduce("figure=table", 'agents=["dreamer, weights 200",focus_lcp]', "seeds=1")
+    assert [one.row.name for one in seen.page[1]] == ["dreamer, weights 200", "focus_lcp"]
 
 
 @shows("Evidence.size")

@@ -26,9 +26,13 @@ def written(value: Any) -> str:
     Examples:
         >>> written(True), written(None), written(("a", 1))
         ('true', 'null', '[a,1]')
+        >>> written("dreamer, weights 1")
+        '"dreamer, weights 1"'
     """
     if isinstance(value, (list, tuple)):
         return f"[{','.join(map(written, value))}]"
+    if isinstance(value, str) and "," in value:
+        return f'"{value}"'
     return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))
 
 

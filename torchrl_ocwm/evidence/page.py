@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -148,7 +149,7 @@ def _lines(figure: Figure, done: Sequence[Result], report: Report) -> dict:
 def _command(wanted: Evidence) -> str:
     values = {one.name: getattr(wanted, one.name) for one in fields(Evidence)}
     settings = [f"{name}={written(value)}" for name, value in values.items() if value not in (None, ())]
-    return f"```bash\nocwm reproduce {' '.join(settings)}\n```"
+    return f"```bash\nocwm reproduce {shlex.join(settings)}\n```"
 
 
 def _making(runs: Sequence[Run], records: dict[str, Record]) -> list[str]:

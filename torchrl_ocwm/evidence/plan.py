@@ -30,8 +30,8 @@ def results(wanted: Evidence) -> list[Result]:
     """All that a figure needs, seed by seed, so that a whole one is there early.
 
     Raises:
-        SettingsError: for a size or an environment whose steps and updates are not known, or an agent that the figure
-            does not have.
+        SettingsError: for a size or an environment whose steps and updates are not known, or an agent or row that
+            the figure does not have.
     """
     rows = _rows(wanted)
     return [
@@ -44,10 +44,11 @@ def results(wanted: Evidence) -> list[Result]:
 
 def _rows(wanted: Evidence) -> list[Row]:
     rows = FIGURES[wanted.figure].rows
-    known = dict.fromkeys(row.agent for row in rows)
-    if odd := [name for name in wanted.agents if name not in known]:
-        raise SettingsError(f"agents must be of those of figure={wanted.figure}, {', '.join(known)}; got {odd[0]!r}")
-    return [row for row in rows if row.agent in (wanted.agents or known)]
+    names = dict.fromkeys(row.agent for row in rows) | dict.fromkeys(row.name for row in rows)
+    if odd := [name for name in wanted.agents if name not in names]:
+        known = "; ".join(names)
+        raise SettingsError(f"agents must be agents or rows of figure={wanted.figure}: {known}. Got {odd[0]!r}")
+    return [row for row in rows if not wanted.agents or {row.agent, row.name} & set(wanted.agents)]
 
 
 def _evaluated(row: Row, env: str, seed: int, wanted: Evidence) -> Evaluated:

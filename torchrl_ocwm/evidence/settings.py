@@ -17,7 +17,7 @@ class Evidence(Settings):
     Args:
         figure: Which of the paper's tables and figures.
         env: Environment, or list of them.
-        agents: The rows of these agents only; none: all rows.
+        agents: Only these rows, or all rows of these agents; none: all rows.
         size: Size of the agents. It also says how many steps, updates and goals there are.
         seeds: Runs of each row, with the seeds 0, 1, 2 and so on.
         steps: Environment steps of each dataset; ``None``: as many as go with the size.
