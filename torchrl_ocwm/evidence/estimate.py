@@ -15,10 +15,12 @@ import torch
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
 from torchrl_ocwm.envs import DrawTarget, Task, make_env, make_task
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs
+from torchrl_ocwm.evidence.datasets import Collected, Data, Drawn, Explored
 from torchrl_ocwm.evidence.queue import to_do
 from torchrl_ocwm.evidence.records import RECORD, Record
-from torchrl_ocwm.evidence.runs import Collected, Data, Drawn, Evaluated, Explored, Run, Trained
+from torchrl_ocwm.evidence.run import Run
 from torchrl_ocwm.evidence.settings import Machine
+from torchrl_ocwm.evidence.trainings import Evaluated, Trained
 from torchrl_ocwm.origin import machine
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.testing import random_records

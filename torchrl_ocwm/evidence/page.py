@@ -19,7 +19,7 @@ from torchrl_ocwm.evidence.figures import FIGURES, Figure
 from torchrl_ocwm.evidence.plan import Result
 from torchrl_ocwm.evidence.queue import in_order
 from torchrl_ocwm.evidence.records import Record
-from torchrl_ocwm.evidence.runs import Run
+from torchrl_ocwm.evidence.run import Run
 from torchrl_ocwm.evidence.settings import Evidence
 
 CURVE = {METRIC: "final score, landmark goals"}

@@ -6,11 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from torchrl_ocwm.evidence.datasets import Collected, Data, Drawn, Explored
 from torchrl_ocwm.evidence.figures import FIGURES, Row
 from torchrl_ocwm.evidence.options import all_options
-from torchrl_ocwm.evidence.runs import Collected, Data, Drawn, Evaluated, Explored, Trained
 from torchrl_ocwm.evidence.settings import Evidence
 from torchrl_ocwm.evidence.setups import BUDGETS, SETUPS, Budget, Setup
+from torchrl_ocwm.evidence.trainings import Evaluated, Trained
 from torchrl_ocwm.settings import SettingsError
 
 #: An acting agent: updates per step of others and of its own, and rounds.

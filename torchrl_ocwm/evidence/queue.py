@@ -16,7 +16,7 @@ from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evidence.command_line import Command
 from torchrl_ocwm.evidence.launchers import Launcher
 from torchrl_ocwm.evidence.records import LOG, Record
-from torchrl_ocwm.evidence.runs import Run
+from torchrl_ocwm.evidence.run import Run
 from torchrl_ocwm.evidence.settings import Machine
 from torchrl_ocwm.origin import commit, machine
 

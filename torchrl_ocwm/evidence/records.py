@@ -10,7 +10,7 @@ from typing import Any
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation.output import writing
 from torchrl_ocwm.evidence.command_line import Command
-from torchrl_ocwm.evidence.runs import Run
+from torchrl_ocwm.evidence.run import Run
 from torchrl_ocwm.settings import flat, to_dict
 
 RECORD, LOG = "run.json", "log.txt"
