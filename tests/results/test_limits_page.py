@@ -9,7 +9,7 @@ NAME, FIGURE = "cube_move/limits", "figures/limits-cube_move-cpu/cube_move"
 ROWS = [f"{agent}, weights {weight}" for agent in ("dreamer", "focus") for weight in (1, 200)]
 #: What was done: no file beside the page has these numbers.
 STATED = [
-    "On 2026-11-27, at commit 4e4cb4b",
+    "On 2026-11-27, at commit 4e4cb4b (what they imagine: 6f41091)",
     "PyTorch 2.13.0 on the CPU",
     "15,000 updates; 100 goals, one seed",
     "a disc of five pixels",
@@ -20,6 +20,8 @@ STATED = [
     "the last of 16 frames",
     "the last 10 are imagined",
     "1, 20 and 100 steps, 16 goals",
+    "after 1 and after 20 steps, the agent imagines the 15 steps",
+    "in metres, 16 goals",
 ]
 
 
@@ -71,14 +73,37 @@ def known() -> list[str]:
     ]
 
 
+def imagined() -> list[str]:
+    """Of the six rows that know where the cube is: after 20 steps, and after the 15 that are imagined."""
+    rows = {
+        (name, how): (printed("believed", how)[name][3], *printed("imagined", how)[name][4:])
+        for how in ("without", "disc")
+        for name in ROWS[1:]
+    }
+    before, fact, imagined, _, off = zip(*rows.values(), strict=True)
+    nearer = [100 * (one - other) for one, other in zip(before, fact, strict=True)]
+    blind = 100 * rows.pop((ROWS[2], "without"))[-1]
+    assert {round(100 * row[-1]) for row in rows.values()} == {1}
+    line = (RESULTS / NAME / "imagined_pcp.md").read_text().splitlines()[2]
+    assert f"{line}\n" in (RESULTS / NAME / "README.md").read_text()
+    pcp = line.strip("| ").split(" | ")
+    return [
+        f"After 20 steps each of these six imagines that 15 more bring the cube to {100 * min(imagined):.0f} to",
+        f"{100 * max(imagined):.0f} cm from the goal. In fact it then is {100 * min(fact):.0f} to {100 * max(fact):.0f} cm",
+        f"has come nearer by {min(nearer):.0f} to {max(nearer):.0f} cm",
+        f"it is 1 cm off, only for FOCUS with weights of 1 and no disc {blind:.0f} cm",
+        f"imagines {100 * float(pcp[6]):.0f} cm where it then is {100 * float(pcp[5]):.0f} cm",
+    ]
+
+
 def test_page() -> None:
-    sentences = [*scores(), *known(), *STATED]
+    sentences = [*scores(), *known(), *imagined(), *STATED]
     assert missing(NAME, sentences) == []
     assert unchecked(NAME, sentences) == []
 
 
 @pytest.mark.parametrize("how", ["without", "disc"])
-@pytest.mark.parametrize("kind", ["reward", "believed"])
+@pytest.mark.parametrize("kind", ["reward", "believed", "imagined"])
 def test_tables(kind: str, how: str) -> None:
     text = (RESULTS / NAME / "README.md").read_text()
     for row, line in zip(ROWS, (RESULTS / NAME / f"{kind}_{how}.md").read_text().splitlines()[2:], strict=True):
