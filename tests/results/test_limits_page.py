@@ -80,7 +80,7 @@ def imagined() -> list[str]:
         for how in ("without", "disc")
         for name in ROWS[1:]
     }
-    before, fact, imagined, _, off = zip(*rows.values(), strict=True)
+    before, fact, believed = list(zip(*rows.values(), strict=True))[:3]
     nearer = [100 * (one - other) for one, other in zip(before, fact, strict=True)]
     blind = 100 * rows.pop((ROWS[2], "without"))[-1]
     assert {round(100 * row[-1]) for row in rows.values()} == {1}
@@ -88,8 +88,9 @@ def imagined() -> list[str]:
     assert f"{line}\n" in (RESULTS / NAME / "README.md").read_text()
     pcp = line.strip("| ").split(" | ")
     return [
-        f"After 20 steps each of these six imagines that 15 more bring the cube to {100 * min(imagined):.0f} to",
-        f"{100 * max(imagined):.0f} cm from the goal. In fact it then is {100 * min(fact):.0f} to {100 * max(fact):.0f} cm",
+        f"After 20 steps each of these six imagines that 15 more bring the cube to {100 * min(believed):.0f} to",
+        f"{100 * max(believed):.0f} cm from the goal.",
+        f"In fact it then is {100 * min(fact):.0f} to {100 * max(fact):.0f} cm",
         f"has come nearer by {min(nearer):.0f} to {max(nearer):.0f} cm",
         f"it is 1 cm off, only for FOCUS with weights of 1 and no disc {blind:.0f} cm",
         f"imagines {100 * float(pcp[6]):.0f} cm where it then is {100 * float(pcp[5]):.0f} cm",
