@@ -57,6 +57,7 @@ def played(folder: Path, **changes: Any) -> dict[str, int]:
     [
         ({}, {"scripted": 2, "random": 1, "reach": 1, "explore": 1}),
         ({"seed_policy": ("random",), "seed_steps": (30,), "steps": 30}, {"random": 3}),
+        ({"round_episodes": 5, "steps": 35}, {"scripted": 2, "random": 1, "reach": 1}),
         ({"round_episodes": 1, "seed_updates": 3}, {"scripted": 2, "random": 1, "reach": 1}),
         ({"behaviours": ("explore",), "update_ratio": 0.05}, {"scripted": 2, "random": 1, "explore": 4}),
     ],

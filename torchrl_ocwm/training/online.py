@@ -191,7 +191,7 @@ class Player:
         self._played: dict[str, float] = {}
 
     def play_round(self) -> None:
-        """Play at least ``round_episodes`` episodes.
+        """Play at least ``round_episodes`` episodes, or what is left of ``steps``.
 
         Raises:
             CollectionError: if one episode after the other fails.
@@ -199,7 +199,7 @@ class Player:
         self._acting.load_state_dict(self._learning.state_dict())
         self._sent = False
         rewards: list[float] = []
-        while len(rewards) < self.online.round_episodes and not self.stop.stopped:
+        while self._wants_more(len(rewards)) and not self.stop.stopped:
             for episode in self.stop.look(self._next_episodes) or ():
                 self._append(episode)
                 rewards.append(self._mean_reward(episode))
@@ -217,6 +217,9 @@ class Player:
         if self._collector is not None:
             end(self._collector)
         self._collector = None
+
+    def _wants_more(self, played: int) -> bool:
+        return played < self.online.round_episodes and self.dataset.num_steps < self.online.steps
 
     def _next_episodes(self) -> list[TensorDictBase]:
         try:
