@@ -16,7 +16,12 @@ ROWS = {
     "focus_lcp, only the encoder learns": "the encoder | – | plain",
     "focus_lcp, only the encoder learns, centred latents": "the encoder | – | centred",
 }
-STATED = ["Reacher, 1,500 updates, 100 goals, one seed", "beside those of 100 frames", "On 2026-11-27"]
+STATED = [
+    "where two seeds of the plain one differ by more",
+    "Reacher, 1,500 updates, 100 goals, one seed",
+    "beside those of 100 frames",
+    "On 2026-11-27",
+]
 
 
 def latents() -> dict[str, list[float]]:
@@ -34,6 +39,16 @@ def test_scores(name: str) -> None:
     assert len(found.rows[name].runs) == 1
 
 
+def on_cube_move() -> str:
+    found, table = (report(f"figures/{name}-cube_move-cpu/cube_move") for name in ("goal_latents", "table"))
+    names = [f"{name}{how}" for how in ("", ", image goals") for name in ("focus_lcp", "focus_lcp, centred latents")]
+    scores = [mean(found, name, "final_score") for name in names]
+    one, other = (float(seed["final_score"].mean()) for seed in table.rows["focus_lcp"].seeds)
+    assert abs(one - other) > max(scores[1] - scores[0], scores[3] - scores[2]) > 0
+    plain, centred, image, centred_image = (f"{score:.2f}" for score in scores)
+    return f"{plain} plain and {centred} centred with positions, {image} and {centred_image} with images"
+
+
 def test_page() -> None:
     text = (RESULTS / NAME / "README.md").read_text()
     assert (RESULTS / NAME / "contrast.md").read_text() in text
@@ -47,6 +62,7 @@ def test_page() -> None:
         f"With a weight of 100 the latents of all places are alike ({heavy[1]:.3f}), and yet the best match is "
         f"{heavy[4]:.0f} mm from the goal; with more contrast it is {nearest:.0f} mm or more",
         "Less than with a weight of 1",
+        on_cube_move(),
         *STATED,
     ]
     assert missing(NAME, sentences) == []
