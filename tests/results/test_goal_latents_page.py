@@ -24,8 +24,8 @@ STATED = [
 ]
 
 
-def latents() -> dict[str, list[float]]:
-    lines = (RESULTS / NAME / "contrast.md").read_text().splitlines()[2:]
+def latents(file: str = "contrast.md") -> dict[str, list[float]]:
+    lines = (RESULTS / NAME / file).read_text().splitlines()[2:]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return {name: [float(number) for number in numbers] for name, *numbers in rows}
 
@@ -55,6 +55,8 @@ def test_page() -> None:
     found = latents()
     heavy, others = found["focus_lcp"], [row for name, row in found.items() if name != "focus_lcp"]
     error = cell(report("figures/table-reacher-cpu/reacher"), "focus_lcp", "final_score").split(" ± ")[1]
+    cube_move = latents("contrast_cube_move.md")["focus_lcp"]
+    assert cube_move[1] > heavy[1]
     nearest = min(row[4] for row in others)
     assert all(row[2] > heavy[2] for row in others)
     sentences = [
@@ -63,6 +65,8 @@ def test_page() -> None:
         f"{heavy[4]:.0f} mm from the goal; with more contrast it is {nearest:.0f} mm or more",
         "Less than with a weight of 1",
         on_cube_move(),
+        f"On Cube move, with a weight of 100, the latents are still more alike ({cube_move[1]:.3f}), and "
+        f"the best match is {cube_move[4]:.0f} mm from the goal ([table]",
         *STATED,
     ]
     assert missing(NAME, sentences) == []
