@@ -16,6 +16,8 @@ STATED = [
     "on a 10 × 10 grid, as many goals as the paper has",
     "than on the 6 × 6 grids",
     "## 100 goals",
+    "15,000 updates for each agent, 100 goals, one seed",
+    "Baselines have weights of 200; those with weights of 1",
     "success within 5 cm",
     "after 250,000 updates of a larger model the paper reports "
     "0.59 ± 0.10 for FOCUS + PCP and 0.70 ± 0.08 for FOCUS + LCP",
@@ -103,9 +105,25 @@ def sides() -> str:
     return f"where x is above 0, it scores {scores[right].mean():.2f}, to the other {scores[~right].mean():.2f}"
 
 
+def same_data() -> list[str]:
+    """The table on Shelf place, in which all agents have the same data."""
+    found, own = report("figures/table-shelf_place-cpu/shelf_place"), report(f"{NAME}/shelf_place/goals_100")
+    assert {len(row.seeds) for row in found.rows.values()} == {1}
+    scores = {name: f"{mean(found, name, 'final_score'):.2f}" for name in found.rows}
+    baselines = [scores[f"{name}, weights 200"] for name in ("dreamer", "focus")]
+    expected, real = (mean(found, "focus_lcp", metric, 100) for metric in ("imagined_distance", "final_distance"))
+    return [
+        f"**FOCUS + PCP scores {scores['focus_pcp']}**, Dreamer {baselines[0]}, FOCUS {baselines[1]}, "
+        f"random actions {scores['random']}",
+        f"{scores['focus_lcp']} with positions and {scores['focus_lcp, image goals']} with images",
+        f"It expects to end {expected:.1f} cm from the goal, and ends {real:.1f} cm from it",
+        f"With data of its own it scored {mean(own, 'focus_lcp', 'final_score'):.2f}",
+    ]
+
+
 def test_page() -> None:
     both = [*(one for run in RUNS for one in sentences(run)), *(one for env in LATENTS for one in latents(env))]
-    said = [*both, *STATED, *hundred(), taken_away(), sides()]
+    said = [*both, *STATED, *hundred(), *same_data(), taken_away(), sides()]
     assert missing(NAME, said) == []
     assert unchecked(NAME, said) == []
 
@@ -136,6 +154,13 @@ def test_scores_of_the_readme() -> None:
     goals = len(shelf.goals)
     assert f"`focus_pcp` scores {first} and {second} on {goals} goals, random actions {random}" in text
     assert f"after 9,000, `focus_lcp` scores {lcp}, with images {images}" in text
+    table = report("figures/table-shelf_place-cpu/shelf_place")
+    names = ("focus_pcp", "dreamer, weights 200", "focus, weights 200", "focus_lcp")
+    first, *both, last = (f"{mean(table, name, 'final_score'):.2f}" for name in names)
+    assert (
+        f"`focus_pcp` {first}, `dreamer` {both[0]} and `focus` {both[1]} with weights of 200, `focus_lcp` {last}"
+        in text
+    )
 
 
 @pytest.mark.parametrize(
