@@ -20,7 +20,7 @@ STATED = [
     "the last of 16 frames",
     "the last 10 are imagined",
     "1, 20 and 100 steps, 16 goals",
-    "after 1 and after 20 steps, the agent imagines the 15 steps",
+    "after 1 and after 20 steps, the agent imagines 15 steps; its actor is taught over 10",
     "in metres, 16 goals",
 ]
 
