@@ -2,10 +2,10 @@
 
     python docs/results/cube_move/limits/imagined.py CHECKPOINT [...]
 
-Run from the repository root. Episodes to a grid of goals; after so many steps the agent imagines 15 more (an actor of
-size ``cpu`` is taught over 10). Mean in metres, at the end of these: how far the object is from the goal in fact; how far
-it is in the imagination from the goal, and from the goal that is decoded there, which is what the reward is made of; and
-how far the decoded goal is off.
+Run from the repository root. Episodes to a grid of goals; after so many steps the agent imagines ``--horizon`` more (an
+actor of size ``cpu`` is taught over 10). Mean in metres, at the end of these: how far the object is from the goal in
+fact; how far it is in the imagination from the goal, and from the goal that is decoded there, which is what the reward is
+made of; and how far the decoded goal is off.
 """
 
 from __future__ import annotations
