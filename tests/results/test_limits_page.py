@@ -20,7 +20,7 @@ STATED = [
     "the last of 16 frames",
     "the last 10 are imagined",
     "1, 20 and 100 steps, 16 goals",
-    "after 1 and after 20 steps, the agent imagines 15 steps; its actor is taught over 10",
+    "after 1 and after 20 steps, the agent imagines the 10 steps",
     "in metres, 16 goals",
 ]
 
@@ -74,7 +74,7 @@ def known() -> list[str]:
 
 
 def imagined() -> list[str]:
-    """Of the six rows that know where the cube is: after 20 steps, and after the 15 that are imagined."""
+    """Of the six rows that know where the cube is: after 20 steps, and after the 10 that are imagined."""
     rows = {
         (name, how): (printed("believed", how)[name][3], *printed("imagined", how)[name][4:])
         for how in ("without", "disc")
@@ -88,7 +88,7 @@ def imagined() -> list[str]:
     assert f"{line}\n" in (RESULTS / NAME / "README.md").read_text()
     pcp = line.strip("| ").split(" | ")
     return [
-        f"After 20 steps each of these six imagines that 15 more bring the cube to {100 * min(believed):.0f} to",
+        f"After 20 steps each of these six imagines that 10 more bring the cube to {100 * min(believed):.0f} to",
         f"{100 * max(believed):.0f} cm from the goal.",
         f"In fact it then is {100 * min(fact):.0f} to {100 * max(fact):.0f} cm",
         f"has come nearer by {min(nearer):.0f} to {max(nearer):.0f} cm",

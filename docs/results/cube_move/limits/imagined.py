@@ -2,10 +2,9 @@
 
     python docs/results/cube_move/limits/imagined.py CHECKPOINT [...]
 
-Run from the repository root. Episodes to a grid of goals; after so many steps the agent imagines ``--horizon`` more (an
-actor of size ``cpu`` is taught over 10). Mean in metres, at the end of these: how far the object is from the goal in
-fact; how far it is in the imagination from the goal, and from the goal that is decoded there, which is what the reward is
-made of; and how far the decoded goal is off.
+Run from the repository root. Episodes to a grid of goals; after so many steps the agent imagines as many as its actor
+is taught over. Mean in metres, at the end of these: how far the object is from the goal in fact; how far it is in the
+imagination from the goal, and from the decoded goal, of which the reward is made; and how far that goal is off.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ def inspect(step: TensorDictBase) -> dict[str, Tensor]:
     }
 
 
-def measure(policy: Policy, goals: Tensor, horizon: int) -> list[str]:
+def measure(policy: Policy, goals: Tensor) -> list[str]:
     """As in :data:`HEAD`, after each of :data:`AFTER`."""
-    agent = policy.agent
+    agent, horizon = policy.agent, policy.agent.size.learning.imagination_horizon
     units, decode = agent.model.units, TensorDictSequential(*agent.model.vectors("latent"))
     with EvaluationEnvs(agent.task, episode_steps=max(AFTER) + horizon, workers=0, envs=len(goals)) as envs:
         episodes = envs.run(policy, goals, inspect=inspect)
@@ -55,14 +54,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoints", nargs="+", metavar="CHECKPOINT", help="of agents that decode positions")
     parser.add_argument("--grid", type=int, default=4, help="goals along each side of the workspace")
-    parser.add_argument("--horizon", type=int, default=15, help="steps that are imagined")
     arguments = parser.parse_args()
     head = ["checkpoint", *(f"{one}, {step}" for step in AFTER for one in HEAD)]
     print("| " + " | ".join(head) + " |\n|---|" + "---:|" * (len(head) - 1))
     for file in arguments.checkpoints:
         policy = load_agent(file)
         goals = policy.agent.task.workspace.grid(arguments.grid).flatten(0, 1)
-        print("| " + " | ".join([file, *measure(policy, goals, arguments.horizon)]) + " |", flush=True)
+        print("| " + " | ".join([file, *measure(policy, goals)]) + " |", flush=True)
 
 
 if __name__ == "__main__":
