@@ -50,6 +50,7 @@ def give(root: Path, found: list[Result]) -> None:
                 commands=(("train", f"x={number}"),),
                 commit=f"abc{number}",
                 machine="another machine",
+                episodes="those there" if run.kind == "trainings" else "",
             ).write(root / run.name)
 
 
@@ -69,6 +70,7 @@ def test_a_page_is_made_again_from_a_page(page: Path, tmp_path: Path) -> None:
     names = ["README.md", "runs.json", "reacher/results.md", "reacher/curves.csv"]
     for name in names:
         assert (again / name).read_text() == (page / name).read_text(), name
+    assert (again / "runs.json").read_text(encoding="utf-8").count('"those there"') == len(found)
     before, after = (Report.load(folder / "reacher" / "results.json") for folder in (page, again))
     assert list(before.rows) == list(after.rows)
     for name, row in before.rows.items():

@@ -34,6 +34,8 @@ from torchrl_ocwm.evidence import (
     write_page,
 )
 from torchrl_ocwm.settings import to_dict
+from torchrl_ocwm.training import CHECKPOINT
+from torchrl_ocwm.training.provenance import trained_on
 
 
 class Here:
@@ -109,6 +111,11 @@ def test_a_whole_figure(work: Callable[..., list[str]], tmp_path: Path) -> None:
     assert "figure=table env=reacher size=debug seeds=1 steps=40 updates=2 goals=1" in text
     assert "`collect env=reacher" in text
     assert str(tmp_path) not in text
+    trainings = [one.evaluated.trained for one in found]
+    records = json.loads((file.parent / "runs.json").read_text(encoding="utf-8"))
+    (episodes,) = {records[trained.name]["episodes"] for trained in trainings}
+    assert episodes == trained_on(tmp_path / trainings[0].name / CHECKPOINT) != ""
+    assert "other episodes" not in text
     record = Record.of(found[0].evaluated, tmp_path)
     assert record.machine in text
     assert record.commit in text
@@ -159,6 +166,26 @@ def test_the_page_of_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert means == pytest.approx({"1": 0.2, "10": 0.3, "100": 0.2, "1000": 0.3})
     assert drawn["goal reconstruction error, m"]["dreamer"]["1"][0] == pytest.approx(0.8)
     assert set(drawn["success within 5 cm"]["dreamer"].values()) == {None}
+
+
+def test_rows_with_other_episodes_are_named(tmp_path: Path) -> None:
+    """Where the dataset was lost and collected again. Targets are drawn into the episodes of the plain one."""
+    wanted = Evidence(figure="limits", size="debug", seeds=1, goals=4, env="cube_move")
+    found = results(wanted)
+    for number, one in enumerate(found):
+        give(tmp_path, one, 0.5)
+        trained = one.evaluated.trained
+        record = replace(Record.of(trained, tmp_path), episodes="again" if number in (1, 2) else "first")
+        record.write(tmp_path / trained.name)
+    assert len({one.evaluated.trained.data.name for one in found}) == 2
+    text = write_page(wanted, found, tmp_path).read_text(encoding="utf-8")
+    (said,) = (line for line in text.splitlines() if line.startswith("**Rows with other episodes**"))
+    assert in_order([found[0].evaluated])[0].name in said
+    assert "collected 2 times" in said
+    first, again = said.partition("the same: ")[2].rstrip(".").split("; ")
+    names = [f"{one.row.name} (seed 0)" for one in found]
+    assert again == ", ".join(names[1:3])
+    assert first == ", ".join([names[0], *names[3:]])
 
 
 def test_its_command_can_be_typed(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -193,6 +194,16 @@ class TestGoingOn:
         provenance.check_may_go_on(file, SHORT, dataset)
         with pytest.raises(CheckpointError, match=r"target_rate: 0\.02 there, 0\.5 here"):
             provenance.check_may_go_on(file, replace(SHORT, target_rate=0.5), dataset)
+
+    def test_a_checkpoint_tells_its_episodes(
+        self, dataset: EpisodeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        file = train(fresh(), dataset, tmp_path, replace(SHORT, updates=1))
+        lengths = dataset.episode_lengths
+        seen = repr(lengths).encode() + dataset.records["action"][: sum(lengths)].numpy().tobytes()
+        assert provenance.trained_on(file) == sha256(seen).hexdigest()
+        monkeypatch.setattr(provenance, "_read", lambda file: None)  # as of a release that did not keep them
+        assert provenance.trained_on(file) == ""
 
     def test_what_changes_nothing_may_change(self, dataset: EpisodeDataset, tmp_path: Path) -> None:
         train(fresh(), dataset, tmp_path, replace(SHORT, updates=2))

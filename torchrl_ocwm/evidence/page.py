@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 from torchrl_ocwm.envs import make_task
@@ -43,20 +43,26 @@ def write_page(wanted: Evidence, results: Sequence[Result], root: Path) -> Path:
     figure = FIGURES[wanted.figure]
     folder = root / "figures" / "-".join([wanted.figure, *wanted.environments, wanted.size])
     runs = in_order(one.evaluated for one in results)
-    records = {run.name: Record.of(run, root) for run in runs}
+    records = {run.name: _record(run, root) for run in runs}
     parts = [f"# {figure.title}"]
     if missing := [run for run in runs if not records[run.name].done]:
         parts.append(f"{len(missing)} of {len(runs)} runs are not done yet: the numbers are of the others.")
     for env in wanted.environments:
         done = [one for one in results if one.env == env and records[one.evaluated.name].done]
         if done:
-            parts += _section(env, figure, done, root, folder)
+            parts += [*_section(env, figure, done, root, folder), *_collected_again(done, records)]
     parts += ["## How it was made", _command(wanted), *_making(runs, records)]
     page = folder / "README.md"
     with writing(page) as file:
         file.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     save_records(folder, {name: record for name, record in records.items() if record.done})
     return page
+
+
+def _record(run: Run, root: Path) -> Record:
+    """What is known of a run; a training that was done elsewhere has no checkpoint here, and keeps what a page said."""
+    record = Record.of(run, root)
+    return replace(record, episodes=run.episodes(root) or record.episodes)
 
 
 def read_report(done: Iterable[Result], root: Path) -> Report:
@@ -115,6 +121,22 @@ def _section(env: str, figure: Figure, done: Sequence[Result], root: Path, folde
         f"goal. {numbers}"
     )
     return [f"## {env}", report.markdown(intervals=True), text, *pictures]
+
+
+def _collected_again(done: Sequence[Result], records: dict[str, Record]) -> list[str]:
+    """Which rows had the same episodes, for each dataset that was collected more than once."""
+    times: dict[str, dict[str, dict[str, None]]] = {}
+    for one in done:
+        trained = one.evaluated.trained
+        collected = in_order([trained.data])[0].name  # targets are drawn into episodes that are there
+        rows = times.setdefault(collected, {}).setdefault(records[trained.name].episodes, {})
+        rows[f"{one.row.name} (seed {trained.seed})"] = None
+    return [
+        f"**Rows with other episodes**: {name} was collected {len(groups)} times, by the same settings. "
+        f"These had the same: {'; '.join(', '.join(rows) for rows in groups.values())}."
+        for name, groups in times.items()
+        if len(groups) > 1
+    ]
 
 
 def _save_curves(path: Path, runs: dict[str, list[Path]]) -> None:

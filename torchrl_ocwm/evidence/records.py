@@ -33,6 +33,7 @@ class Record:
         commands: What did it, paths as seen from the folder of all runs.
         commit: Of the code that did it last.
         machine: That did it last.
+        episodes: Of a training: what tells the episodes that it had from others, collected by the same settings.
     """
 
     content: dict[str, Any]
@@ -43,6 +44,7 @@ class Record:
     commands: tuple[Command, ...] = ()
     commit: str = ""
     machine: str = ""
+    episodes: str = ""
 
     @classmethod
     def of(cls, run: Run, root: Path) -> Record:

@@ -57,6 +57,10 @@ class Run(ABC):
     def reached(self, root: Path) -> int:
         """How much of the work is done, as far as its files say."""
 
+    def episodes(self, root: Path) -> str:  # noqa: ARG002
+        """What tells the episodes that it learnt from, as far as its files say."""
+        return ""
+
     @cached_property
     def name(self) -> str:
         """Its folder in that of all runs; runs of the same name are the same.

@@ -15,6 +15,7 @@ from torchrl_ocwm.evidence.run import Run
 from torchrl_ocwm.evidence.settings import Machine
 from torchrl_ocwm.settings import change
 from torchrl_ocwm.training import CHECKPOINT, Training
+from torchrl_ocwm.training.provenance import trained_on
 
 #: Episodes of each evaluation during training, to as many of the landmark goals.
 LANDMARKS = 5
@@ -109,6 +110,11 @@ class Trained(Run):
     def reached(self, root: Path) -> int:
         """Updates that are logged."""
         return last_step(root / self.name)
+
+    def episodes(self, root: Path) -> str:
+        """Their digest, from the checkpoint."""
+        file = root / self.name / CHECKPOINT
+        return trained_on(file) if file.exists() else ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,6 +18,16 @@ def trained_with(training: Training, dataset: EpisodeDataset) -> dict[str, Any]:
     return {"training": training.deciding(), "dataset": _fingerprint(dataset, len(dataset.episode_lengths))}
 
 
+def trained_on(file: Path) -> str:
+    """What tells the episodes that a checkpoint was trained on: their digest, or ``""`` if it does not say.
+
+    Raises:
+        CheckpointError: if it is none, or damaged.
+    """
+    there = _read(file)
+    return "" if there is None else there["dataset"]["digest"]
+
+
 def check_may_go_on(file: Path, training: Training, dataset: EpisodeDataset, *, grows: bool = False) -> None:
     """Raise unless a run may go on from a checkpoint with these settings and this dataset.
 
