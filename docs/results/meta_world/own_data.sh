@@ -18,5 +18,6 @@ python examples/train_online.py agent="$agent" env=shelf_place size="$size" data
 mkdir -p "$here"
 cp "$run/config.yaml" "$here/seed_0.yaml"
 cp "$run/log/scalars/evaluation/final_score.csv" "$here/seed_0.csv"
+cp "$run/log/scalars/collected/steps.csv" "$here/seed_0_steps.csv"
 python examples/evaluate.py goals="$goals" image_goals=true episode_steps=60 envs=10 workers=0 output="$here" \
   checkpoint="$run/checkpoint.zip"
