@@ -9,7 +9,7 @@ updates=${UPDATES:-15000} goals=${GOALS:-100}
 here=docs/results/meta_world/shelf_place/own_data run=outputs/meta_world/own_data/$agent data=data/own_data_$agent
 
 python examples/train_online.py agent="$agent" env=shelf_place size="$size" dataset="$data" output="$run" \
-  training.updates="$updates" training.eval_interval=1500 training.eval_episodes=5 training.video_interval=0 \
+  training.updates="$updates" training.eval_interval=$((updates / 10)) training.eval_episodes=5 training.video_interval=0 \
   training.threads=1 env.options.image_size=32 env.options.mask_scale=5 env.options.horizon=60 \
   env.options.action_repeat=4 "online.seed_policy=[scripted,random]" "online.seed_steps=[$scripted,$random]" \
   online.seed_updates=$((updates / 3)) online.steps="$steps" online.round_episodes=104 online.update_ratio=0.4 \
