@@ -183,7 +183,7 @@ def test_rows_with_other_episodes_are_named(tmp_path: Path) -> None:
     assert in_order([found[0].evaluated])[0].name in said
     assert "collected 2 times" in said
     first, again = said.partition("the same: ")[2].rstrip(".").split("; ")
-    names = [f"{one.row.name} (seed 0)" for one in found]
+    names = [f"`{one.row.name}` (seed 0)" for one in found]
     assert again == ", ".join(names[1:3])
     assert first == ", ".join([names[0], *names[3:]])
 

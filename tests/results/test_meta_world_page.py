@@ -18,7 +18,7 @@ STATED = [
     "than on the 6 × 6 grids",
     "## 100 goals",
     "15,000 updates for each agent, 100 goals, one seed",
-    "Dreamer + PCP and the baselines with weights of 1 came a day later",
+    "Dreamer + PCP and the baselines with weights of 1 came later",
     "success within 5 cm",
     "after 250,000 updates of a larger model the paper reports "
     "0.59 ± 0.10 for FOCUS + PCP and 0.70 ± 0.08 for FOCUS + LCP",

@@ -130,7 +130,7 @@ def _collected_again(done: Sequence[Result], records: dict[str, Record]) -> list
         trained = one.evaluated.trained
         collected = in_order([trained.data])[0].name  # targets are drawn into episodes that are there
         rows = times.setdefault(collected, {}).setdefault(records[trained.name].episodes, {})
-        rows[f"{one.row.name} (seed {trained.seed})"] = None
+        rows[f"`{one.row.name}` (seed {trained.seed})"] = None
     return [
         f"**Rows with other episodes**: {name} was collected {len(groups)} times, by the same settings. "
         f"These had the same: {'; '.join(', '.join(rows) for rows in groups.values())}."
