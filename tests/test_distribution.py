@@ -36,7 +36,7 @@ from torchrl_ocwm.evidence import Record, queue
 from torchrl_ocwm.origin import commit
 
 run, record = SimpleNamespace(name="runs"), Record(content={}, pace="", work=0)
-job = queue.Job(run, Path(), [], record, threads=1, program=queue.PROGRAM)
+job = queue.Job(run, Path(), [], record, threads=1, device="cpu", program=queue.PROGRAM)
 job.folder.mkdir()
 queue._run(job, ("collect", "--cfg", "job"), Event(), {}, lambda: None)
 print(commit())

@@ -8,18 +8,24 @@ import subprocess
 from importlib.metadata import version
 from pathlib import Path
 
+import torch
+
 #: Beside the settings of a run.
 MADE = "made.json"
 
 
-def machine() -> str:
+def machine(device: str = "cpu") -> str:
     """Where this runs, in words.
+
+    Args:
+        device: What computes: a GPU is named too.
 
     Examples:
         >>> "cores" in machine()
         True
     """
-    return f"{_processor()}, {os.cpu_count()} cores"
+    gpu = device.startswith("cuda") and torch.cuda.is_available()
+    return f"{_processor()}, {os.cpu_count()} cores" + (f", {torch.cuda.get_device_name(device)}" if gpu else "")
 
 
 def _processor() -> str:

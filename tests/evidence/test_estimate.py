@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from torchrl_ocwm.agents import build_agent
+from torchrl_ocwm.devices import DeviceError
 from torchrl_ocwm.evidence import (
     Collected,
     Drawn,
@@ -61,6 +62,21 @@ def test_what_others_took_counts(tmp_path: Path) -> None:
     for other in ({"agent": "focus"}, {"size": "cpu"}, {"data": replace(DATA, options={})}):
         [unlike] = forecast([replace(TRAINED, **other)], tmp_path, Machine())
         assert unlike.seconds == pytest.approx(60)
+
+
+@pytest.mark.usefixtures("no_timing")
+def test_what_others_took_on_a_gpu_counts_on_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "a GPU")
+    keep(replace(TRAINED, seed=1), tmp_path, 100.0, where=machine("cuda"))
+    for device, seconds in (("cpu", 60), ("cuda", 110)):
+        [found] = forecast([TRAINED], tmp_path, Machine(device=device))
+        assert found.seconds == pytest.approx(seconds)
+
+
+def test_there_must_be_such_a_device(tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match=r"device 'gpu' cannot be used"):
+        forecast([TRAINED], tmp_path, Machine(device="gpu"))
 
 
 @pytest.mark.usefixtures("no_timing")

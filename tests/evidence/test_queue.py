@@ -132,6 +132,15 @@ def test_what_is_needed_is_done_first_and_nothing_twice(work: Callable[..., list
     assert work(last, Stub(title="new", after=(second,)))[4:] == ["new"]
 
 
+def test_the_gpu_of_a_run_is_kept_with_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"a GPU for {device}")
+    for device, name in (("cpu", "cores"), ("cuda", "cores, a GPU for cuda")):
+        how = Machine(device=device, workers=1)
+        work_off([Stub(title=device)], tmp_path, how, LAUNCHERS["local"](how))
+        assert Record.of(Stub(title=device), tmp_path).machine.endswith(name)
+
+
 def test_what_needs_another_waits_for_it_where_there_is_room(work: Callable[..., list[str]]) -> None:
     data = Stub(title="data", what="nap")
     assert work(Stub(title="agent", what="slept", after=(data,)), Stub(title="free"), workers=3)[2] == "agent"

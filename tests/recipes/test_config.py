@@ -7,13 +7,14 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, make_dataclass
 from itertools import cycle
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
+import torch
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
@@ -365,6 +366,12 @@ class TestHydra:
         assert OmegaConf.load(tmp_path / "run" / "config.yaml") == to_dict(Training(updates=3))
         made = json.loads((tmp_path / "run" / "made.json").read_text())
         assert made == {"commit": commit(), "machine": machine()}
+
+    def test_keeps_the_gpu_that_it_trained_on(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+        monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"a GPU for {device}")
+        keep_settings(make_dataclass("Settings", ["training"])(Training(device="cuda:1")), tmp_path)
+        assert json.loads((tmp_path / "made.json").read_text())["machine"].endswith("cores, a GPU for cuda:1")
 
 
 @pytest.mark.parametrize(

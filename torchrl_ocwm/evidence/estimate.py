@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from torchrl_ocwm.agents import AGENTS, SIZES, Agent, build_agent
+from torchrl_ocwm.devices import usable_device
 from torchrl_ocwm.envs import DrawTarget, Task, make_env, make_task
 from torchrl_ocwm.evaluation.episodes import EvaluationEnvs
 from torchrl_ocwm.evidence.datasets import Collected, Data, Drawn, Explored
@@ -108,7 +109,7 @@ class Paces:
         known: dict[str, list[float]] = {}
         for file in root.glob(f"*/*/{RECORD}"):
             record = Record.read(file)
-            if record.done and record.machine == machine():
+            if record.done and record.machine == machine(how.device):
                 known.setdefault(record.pace, []).append(record.seconds / record.work)
         self._known = {pace: statistics.median(seconds) for pace, seconds in known.items()}
 
@@ -136,14 +137,18 @@ class Paces:
 
 
 def seconds_of_an_update(agent: Agent, how: Machine) -> float:
-    """Of an agent, on random records; the first update is not counted."""
-    threads = torch.get_num_threads()
+    """Of an agent, on random records; the first update is not counted.
+
+    Raises:
+        DeviceError: if there is no such device here.
+    """
+    device, threads = usable_device(how.device), torch.get_num_threads()
     torch.set_num_threads(how.threads)
     try:
-        stepper = make_stepper(agent.to(how.device).train(), Training(device=how.device))
+        stepper = make_stepper(agent.to(device).train(), Training(device=how.device))
         learning = agent.size.learning
-        batch = random_records(agent.task, learning.batch_size, learning.slice_len).to(how.device)
-        if any(stepper.resolve(torch.device(how.device))):
+        batch = random_records(agent.task, learning.batch_size, learning.slice_len).to(device)
+        if any(stepper.resolve(device)):
             stepper.warmup(batch.copy())
         stepper.step(None, batch.copy())
         return _seconds(lambda: [stepper.step(None, batch.copy()) for _ in range(_UPDATES)], _UPDATES)

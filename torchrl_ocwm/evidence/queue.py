@@ -39,6 +39,7 @@ class Job:
         commands: What does it.
         record: What is known of it so far.
         threads: Threads of each process.
+        device: Where it trains.
         program: The module that does a command.
     """
 
@@ -47,6 +48,7 @@ class Job:
     commands: Sequence[Command]
     record: Record
     threads: int
+    device: str
     program: str
 
     @property
@@ -113,7 +115,7 @@ def work_off(
                 # Commands are kept as seen from the root: the folder of all runs may be moved.
                 seconds, commands = 0.0 if record.done else record.seconds, tuple(run.commands(Path(), how))
                 record = replace(record, commands=commands, seconds=seconds, done=False)
-                job = Job(run, root, run.commands(root, how), record, how.threads, PROGRAM)
+                job = Job(run, root, run.commands(root, how), record, how.threads, how.device, PROGRAM)
                 at_work[launcher.submit(perform, job)] = run
             if not at_work:
                 break
@@ -147,7 +149,7 @@ def perform(job: Job, stop: Event, environment: Mapping[str, str]) -> None:
         RunFailedError: if a command fails or is stopped, or ends before all is done.
     """
     job.folder.mkdir(parents=True, exist_ok=True)
-    record = replace(job.record, commit=commit(), machine=machine())
+    record = replace(job.record, commit=commit(), machine=machine(job.device))
     before, start = record.seconds, time.monotonic()
 
     def note(done: bool = False) -> None:

@@ -138,8 +138,9 @@ def keep_settings(settings: Any, folder: Path) -> None:
     """
     with writing(folder / "config.yaml") as new:
         OmegaConf.save(OmegaConf.create(kept(settings, folder)), new)
+    device = to_dict(settings).get("training", {}).get("device", "cpu")
     with writing(folder / MADE) as new:
-        new.write_text(json.dumps({"commit": commit(), "machine": machine()}) + "\n", encoding="utf-8")
+        new.write_text(json.dumps({"commit": commit(), "machine": machine(device)}) + "\n", encoding="utf-8")
 
 
 def kept(settings: Any, folder: Path) -> dict[str, Any]:
