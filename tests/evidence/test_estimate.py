@@ -66,6 +66,8 @@ def test_what_others_took_counts(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("no_timing")
 def test_what_others_took_on_a_gpu_counts_on_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert machine("cuda") == machine()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "a GPU")
     keep(replace(TRAINED, seed=1), tmp_path, 100.0, where=machine("cuda"))

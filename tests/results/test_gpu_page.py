@@ -19,7 +19,7 @@ AGENTS = ("dreamer_pcp", "focus_lcp", "focus_pcp")
 #: What was done: no file beside the page has these numbers.
 STATED = [
     "PyTorch 2.11.0, twice for 15 minutes",
-    "On 2026-11-28, from commit 5487925",
+    "On 2026-11-28, from commit 5487925; the records say 0f959605+",
     "128 frames of 64 × 64",
     "a loss of `dreamer_pcp` was 6.2% off, where 5% is allowed. Why is not known; on a CPU it is within 1%",
     "at 32 × 32",

@@ -107,9 +107,10 @@ class Paces:
     def __init__(self, root: Path, how: Machine) -> None:
         self.how = how
         known: dict[str, list[float]] = {}
+        here = machine(how.device)
         for file in root.glob(f"*/*/{RECORD}"):
             record = Record.read(file)
-            if record.done and record.machine == machine(how.device):
+            if record.done and record.machine == here:
                 known.setdefault(record.pace, []).append(record.seconds / record.work)
         self._known = {pace: statistics.median(seconds) for pace, seconds in known.items()}
 
