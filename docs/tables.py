@@ -10,6 +10,7 @@ A table stands in a page between ``<!-- begin table: WHAT -->`` and ``<!-- end -
     settings CLASS [AT]    the settings of a class, their names after AT
     sizes FIELD            the values of all sizes: ``architecture`` or ``learning``
     options                the options of all environments
+    trained                the trained agents that come with the package, by their cards
 """
 
 from __future__ import annotations
@@ -27,12 +28,13 @@ from typing import Any, get_type_hints
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-from torchrl_ocwm.agents import AGENTS, SIZES  # noqa: E402
+from torchrl_ocwm.agents import AGENTS, SIZES, shipped_agents  # noqa: E402
 from torchrl_ocwm.envs import ENVIRONMENTS  # noqa: E402
 from torchrl_ocwm.parts import Part  # noqa: E402
 from torchrl_ocwm.recipes import code, is_group, values, written_out  # noqa: E402
 from torchrl_ocwm.settings import Settings, field_docs, plain_text  # noqa: E402
 
+CELLS = re.compile(r"^\| (.+) \|$", re.MULTILINE)
 TABLE = re.compile(r"(<!-- begin table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -61,8 +63,8 @@ def written(text: str) -> str:
 def table(what: str) -> str:
     """A table, one line for each row, and an empty line."""
     kind, *arguments = what.split()
-    makers = {"agents": agents, "parts": parts, "settings": settings, "sizes": sizes, "options": options}
-    head, *rows = makers[kind](*arguments)
+    makers = (agents, parts, settings, sizes, options, trained)
+    head, *rows = {maker.__name__: maker for maker in makers}[kind](*arguments)
     return "".join(f"| {' | '.join(row)} |\n" for row in (head, ["---"] * len(head), *rows))
 
 
@@ -108,6 +110,21 @@ def options() -> Iterator[Sequence[str]]:
         kind, one = next((kind, one) for kind, one in zip(kinds, having, strict=True) if one)
         defaults = ["–" if one is None else default(one) for one in having]
         yield code(name), *defaults, values(kind, one), field_docs(kind)[name]
+
+
+def trained() -> Iterator[Sequence[str]]:
+    """A line for each agent that comes with the package, from the tables of its card."""
+    yield "name", "updates", "goals", "final score", "goals as images", "success within 5 cm", "final distance, m"
+    for name in shipped_agents():
+        place = f"torchrl_ocwm/trained/{name}/README.md"
+        card = (ROOT / place).read_text(encoding="utf-8")
+        lines = {first: rest for first, *rest in (line.split(" | ") for line in CELLS.findall(card))}
+        row, goals = name.split("/")[1], re.findall(r"^(\d+) goals", card, re.MULTILINE)
+        positions, images = lines.get(row), lines.get(f"{row}, image goals")
+        scores = [cells[1] if cells else "–" for cells in (positions, images)]
+        _, _, _, success, distance, *_ = positions or images or []
+        updates = lines["training"][0].split(" updates")[0]
+        yield f"[{code(name)}](../{place})", updates, *goals, *scores, success, distance
 
 
 def rows_of(kind: type[Settings], at: str = "") -> Iterator[Sequence[str]]:

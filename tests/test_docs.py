@@ -14,7 +14,7 @@ from types import ModuleType
 import pytest
 
 import torchrl_ocwm
-from torchrl_ocwm.agents import AGENTS, AgentConfig, Size
+from torchrl_ocwm.agents import AGENTS, AgentConfig, Size, shipped_agents
 from torchrl_ocwm.agents.checkpoint import Description
 from torchrl_ocwm.envs import ENVIRONMENTS, ActionRange, Task, Workspace
 from torchrl_ocwm.envs.options import EnvOptions
@@ -84,11 +84,18 @@ def test_tables_are_those_of_the_code() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_trained_agents_are_listed_by_their_cards() -> None:
+    page = (ROOT / "docs" / "getting_started.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| \[`(\w+/\w+)`\]", page, re.MULTILINE) == list(shipped_agents())
+    assert "/reacher/focus_lcp/README.md) | 1,500 | 100 | 0.87 | 0.85 | 0.99 | 0.019 |" in page
+    assert "/shelf_place/focus_pcp/README.md) | 15,000 | 100 | 0.76 | – | 0.60 | 0.083 |" in page
+
+
 def test_every_settings_class_has_a_table() -> None:
     tables = set(re.findall(r"<!-- begin table: (.+?) -->", "".join(page.read_text() for page in PAGES)))
     named = {word.rpartition(".")[2] for table in tables if table.startswith("settings ") for word in table.split()[1:]}
     parts = {table.split()[1] for table in tables if table.startswith("parts ")}
-    assert {"agents", "options", "sizes architecture", "sizes learning"} <= tables
+    assert {"agents", "options", "sizes architecture", "sizes learning", "trained"} <= tables
     assert parts == set(Part.registered)
     # They hold others, are shown otherwise, or are what datasets and checkpoints keep.
     others = {ActionRange, AgentConfig, Description, EnvChoice, RecordedEnv, Size, Task, Workspace}
