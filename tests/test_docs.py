@@ -91,6 +91,15 @@ def test_trained_agents_are_listed_by_their_cards() -> None:
     assert "/shelf_place/focus_pcp/README.md) | 15,000 | 100 | 0.76 | – | 0.60 | 0.083 |" in page
 
 
+@pytest.mark.parametrize("name", shipped_agents())
+def test_the_card_of_a_trained_agent_says_where_it_is_from(name: str) -> None:
+    card = (ROOT / "torchrl_ocwm" / "trained" / name / "README.md").read_text(encoding="utf-8")
+    said = dict(re.findall(r"^\| (\w+) \| ([^|]+) \|$", card, re.MULTILINE))
+    assert {"agent", "environment", "data", "training", "commit"} <= said.keys()
+    assert "seed" in said["training"]
+    assert re.match(r"[0-9a-f]{8}\b", said["commit"])
+
+
 def test_every_settings_class_has_a_table() -> None:
     tables = set(re.findall(r"<!-- begin table: (.+?) -->", "".join(page.read_text() for page in PAGES)))
     named = {word.rpartition(".")[2] for table in tables if table.startswith("settings ") for word in table.split()[1:]}
