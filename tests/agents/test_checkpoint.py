@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from torchrl._utils import logger
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_ocwm import load_agent, save_agent
@@ -36,6 +37,23 @@ def test_an_agent_from_a_loop_of_ones_own(tmp_path: Path) -> None:
     for name, value in agent.loss.state_dict().items():
         if isinstance(value, torch.Tensor):
             torch.testing.assert_close(loaded.loss.state_dict()[name], value, rtol=0, atol=0, msg=name)
+
+
+@pytest.mark.parametrize(("kind", "warned"), [("agent", 0), ("run", 1)])
+def test_another_pytorch_is_said_of_a_run_alone(
+    agent: Agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, warned: int
+) -> None:
+    """The weights of an agent are checked by name and shape; those of a run have what PyTorch's modules call them."""
+    if kind == "agent":
+        save_agent(agent, tmp_path / "file.zip")
+    else:
+        Archive(agent=describe(agent), loss_module=agent.loss).save(tmp_path / "file.zip")
+    said: list[str] = []
+    monkeypatch.setattr(logger, "warning", lambda message, *_: said.append(message))
+    monkeypatch.setattr(torch, "__version__", "9.9.9")
+    load_agent(tmp_path / "file.zip")
+    assert len(said) == warned
+    assert all("version skew" in one for one in said)
 
 
 def test_a_device_that_is_not_there(agent: Agent, tmp_path: Path) -> None:

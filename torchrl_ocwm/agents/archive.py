@@ -34,6 +34,7 @@ class Archive(Checkpoint):
 
     Args:
         metadata: Kept in the file's manifest (:func:`read_manifest`); must fit in JSON.
+        any_version: Do not warn of a file that another PyTorch wrote, as what it holds is checked by name and shape.
         components: What to keep, by name.
 
     Examples:
@@ -44,9 +45,9 @@ class Archive(Checkpoint):
         {'colour': 'red'}
     """
 
-    def __init__(self, *, metadata: dict[str, Any] | None = None, **components: Any) -> None:
+    def __init__(self, *, metadata: dict[str, Any] | None = None, any_version: bool = False, **components: Any) -> None:
         super().__init__(format="archive", **components)
-        self.metadata = metadata or {}
+        self.metadata, self.any_version = metadata or {}, any_version
         # TorchRL's own choice writes memory-mapped files, and a disk that fills up under them kills the process.
         self.register_adapter(HasStateDict, StateDictCheckpointAdapter("archive"))
 
@@ -81,6 +82,9 @@ class Archive(Checkpoint):
         except (CheckpointError, OSError) as error:
             reason = textwrap.shorten(str(error), _REASON, placeholder=" …")  # PyTorch names each weight
             raise CheckpointError(f"{path}: cannot be loaded ({reason})") from error
+
+    def _compare_versions(self, manifest_versions: object) -> dict[str, Any]:  # type: ignore[override]
+        return {} if self.any_version else Checkpoint._compare_versions(manifest_versions)
 
 
 def read_manifest(path: str | Path) -> dict[str, Any]:

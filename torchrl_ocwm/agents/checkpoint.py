@@ -77,7 +77,7 @@ def load_agent(path: str | Path, *, behaviour: str | None = None, device: torch.
     agent = rebuild(read_description(path))
     lasting = "weights" in Archive.manifest(path)["components"]  # which was checked with the description
     kept: dict[str, Any] = {"weights": AgentWeights(agent)} if lasting else {"loss_module": agent.loss}
-    Archive(**kept).load(path, map_location="cpu")
+    Archive(any_version=lasting, **kept).load(path, map_location="cpu")
     agent.to(device).eval().requires_grad_(False)
     return agent.policy(behaviour)
 
@@ -186,7 +186,7 @@ def read_description(path: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: a TorchRL checkpoint, but not of an agent of torchrl_ocwm ({sorted(components)})"
         )
-    description = Archive(agent={}).load(path).values.get("agent")
+    description = Archive(any_version=True, agent={}).load(path).values.get("agent")
     try:
         with torch.device("meta"):  # shapes without memory
             needed = sum(value.numel() * value.itemsize for value in rebuild(description).loss.parameters())
