@@ -51,6 +51,7 @@ def give(root: Path, found: list[Result]) -> None:
                 commit=f"abc{number}",
                 machine="another machine",
                 episodes="those there" if run.kind == "trainings" else "",
+                coverage={"finger": {"moves": 0.5, "visited": 0.25}} if run.kind == "datasets" else {},
             ).write(root / run.name)
 
 
@@ -71,6 +72,7 @@ def test_a_page_is_made_again_from_a_page(page: Path, tmp_path: Path) -> None:
     for name in names:
         assert (again / name).read_text() == (page / name).read_text(), name
     assert (again / "runs.json").read_text(encoding="utf-8").count('"those there"') == len(found)
+    assert (again / "README.md").read_text(encoding="utf-8").count("| finger | 50.0% | 25% |") == len(found)
     before, after = (Report.load(folder / "reacher" / "results.json") for folder in (page, again))
     assert list(before.rows) == list(after.rows)
     for name, row in before.rows.items():

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from torchrl_ocwm.console import COMMANDS
+from torchrl_ocwm.data import EpisodeDataset, dataset_coverage
 from torchrl_ocwm.errors import UserError
 from torchrl_ocwm.evaluation import Report
 from torchrl_ocwm.evaluation.report import ReportError
@@ -116,6 +117,12 @@ def test_a_whole_figure(work: Callable[..., list[str]], tmp_path: Path) -> None:
     (episodes,) = {records[trained.name]["episodes"] for trained in trainings}
     assert episodes == trained_on(tmp_path / trainings[0].name / CHECKPOINT) != ""
     assert "other episodes" not in text
+    data = trainings[0].data
+    with EpisodeDataset.open(data.dataset(tmp_path)) as dataset:
+        seen = dataset_coverage(dataset, dataset.task.objects, dataset.task.workspace)["finger"]
+    assert records[data.name]["coverage"] == {"finger": seen._asdict()}
+    shown = ", ".join(f"`{row.name}`" for row in FIGURES["table"].rows)
+    assert f"| {data.name} | {shown} | finger | {seen.moves:.1%} | {seen.visited:.0%} |" in text
     record = Record.of(found[0].evaluated, tmp_path)
     assert record.machine in text
     assert record.commit in text
@@ -186,6 +193,24 @@ def test_rows_with_other_episodes_are_named(tmp_path: Path) -> None:
     names = [f"`{one.row.name}` (seed 0)" for one in found]
     assert again == ", ".join(names[1:3])
     assert first == ", ".join([names[0], *names[3:]])
+
+
+def test_what_data_shows_of_the_objects(tmp_path: Path) -> None:
+    """A line for each dataset and object; none for what no page and no file knows."""
+    wanted = Evidence(figure="exploration", size="debug", seeds=1, goals=4)
+    found = results(wanted)
+    for number, one in enumerate(found):
+        give(tmp_path, one, 0.5)
+        data = one.evaluated.trained.data
+        seen = {"cube": {"moves": number / 1000, "visited": 0.25}} if number else {}
+        replace(Record.of(data, tmp_path), coverage=seen).write(tmp_path / data.name)
+    text = write_page(wanted, found, tmp_path).read_text(encoding="utf-8")
+    names = [one.evaluated.trained.data.name for one in found]
+    assert [line for line in text.splitlines() if "| cube |" in line] == [
+        f"| {name} | `{one.row.name}` | cube | 0.{number}% | 25% |"
+        for number, (name, one) in enumerate(zip(names, found, strict=True))
+        if number
+    ]
 
 
 def test_its_command_can_be_typed(tmp_path: Path) -> None:

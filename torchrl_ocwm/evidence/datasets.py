@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_ocwm.agents import AGENTS, SIZES
-from torchrl_ocwm.data import DatasetError, EpisodeDataset
+from torchrl_ocwm.data import DatasetError, EpisodeDataset, dataset_coverage
 from torchrl_ocwm.evidence.command_line import Command, given, override
 from torchrl_ocwm.evidence.options import all_options, image_size
 from torchrl_ocwm.evidence.run import Run
@@ -42,6 +42,15 @@ class Data(Run):
     def reached(self, root: Path) -> int:
         """Steps collected."""
         return steps_in(self.dataset(root))
+
+    def coverage(self, root: Path) -> dict[str, dict[str, float]]:
+        """How often each object moves, and how much of the workspace it visits."""
+        try:
+            with EpisodeDataset.open(self.dataset(root)) as dataset:
+                seen = dataset_coverage(dataset, dataset.task.objects, dataset.task.workspace)
+        except DatasetError:
+            return {}
+        return {name: one._asdict() for name, one in seen.items()}
 
 
 @dataclass(frozen=True, kw_only=True)

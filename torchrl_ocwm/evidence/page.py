@@ -50,7 +50,8 @@ def write_page(wanted: Evidence, results: Sequence[Result], root: Path) -> Path:
     for env in wanted.environments:
         done = [one for one in results if one.env == env and records[one.evaluated.name].done]
         if done:
-            parts += [*_section(env, figure, done, root, folder), *_collected_again(done, records)]
+            parts += [*_section(env, figure, done, root, folder), *_shown(done, records)]
+            parts += _collected_again(done, records)
     parts += ["## How it was made", _command(wanted), *_making(runs, records)]
     page = folder / "README.md"
     with writing(page) as file:
@@ -60,9 +61,10 @@ def write_page(wanted: Evidence, results: Sequence[Result], root: Path) -> Path:
 
 
 def _record(run: Run, root: Path) -> Record:
-    """What is known of a run; a training that was done elsewhere has no checkpoint here, and keeps what a page said."""
+    """What is known of a run; of one that was done elsewhere are no files here, and what a page said is kept."""
     record = Record.of(run, root)
-    return replace(record, episodes=run.episodes(root) or record.episodes)
+    episodes, coverage = run.episodes(root) or record.episodes, run.coverage(root) or record.coverage
+    return replace(record, episodes=episodes, coverage=coverage)
 
 
 def read_report(done: Iterable[Result], root: Path) -> Report:
@@ -121,6 +123,20 @@ def _section(env: str, figure: Figure, done: Sequence[Result], root: Path, folde
         f"goal. {numbers}"
     )
     return [f"## {env}", report.markdown(intervals=True), text, *pictures]
+
+
+def _shown(done: Sequence[Result], records: dict[str, Record]) -> list[str]:
+    """What each dataset shows of the objects: nobody learns to move what never moves."""
+    rows: dict[str, dict[str, None]] = {}
+    for one in done:
+        rows.setdefault(one.evaluated.trained.data.name, {})[f"`{one.row.name}`"] = None
+    lines = [
+        f"| {name} | {', '.join(learnt)} | {thing} | {seen['moves']:.1%} | {seen['visited']:.0%} |"
+        for name, learnt in rows.items()
+        for thing, seen in records[name].coverage.items()
+    ]
+    head = ["| data | rows | object | steps in which it moves | workspace visited |", "|---|---|---|---|---|"]
+    return ["\n".join([*head, *lines])] if lines else []
 
 
 def _collected_again(done: Sequence[Result], records: dict[str, Record]) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,8 @@ class Record:
         commit: Of the code that did it last.
         machine: That did it last.
         episodes: Of a training: what tells the episodes that it had from others, collected by the same settings.
+        coverage: Of a dataset: object → how often it moves, and how much of the workspace it visits
+            (:class:`~torchrl_ocwm.data.Coverage`).
     """
 
     content: dict[str, Any]
@@ -45,6 +47,7 @@ class Record:
     commit: str = ""
     machine: str = ""
     episodes: str = ""
+    coverage: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, run: Run, root: Path) -> Record:

@@ -61,6 +61,10 @@ class Run(ABC):
         """What tells the episodes that it learnt from, as far as its files say."""
         return ""
 
+    def coverage(self, root: Path) -> dict[str, dict[str, float]]:  # noqa: ARG002
+        """Of a dataset: what it shows of each object, as far as its files say."""
+        return {}
+
     @cached_property
     def name(self) -> str:
         """Its folder in that of all runs; runs of the same name are the same.
