@@ -23,7 +23,7 @@ def test_records_are_those_of_the_page(page: Path) -> None:
     records = json.loads((page.parent / RUNS).read_text(encoding="utf-8"))
     text = page.read_text(encoding="utf-8")
     listed = re.findall(
-        r"^\| ((?:datasets|trainings|evaluations)/\S+) \| .* \| (\w+\+?) \| (.+) \|$", text, re.MULTILINE
+        r"^\| ((?:datasets|trainings|evaluations)/\S+) \| .* \| ([0-9a-f]{8}\+?) \| (.+) \|$", text, re.MULTILINE
     )
     assert len(listed) > 3
     assert [name for name, _, _ in listed] == list(records)
