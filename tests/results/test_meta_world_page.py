@@ -272,8 +272,8 @@ def test_scores_of_the_readme() -> None:
     scores = [f"{mean(place, name, 'final_score'):.2f}" for name in names]
     said = (
         f"`focus_lcp` {scores[0]}, with images {scores[1]}, `dreamer_pcp` {scores[2]}, `focus_pcp` {scores[3]}, "
-        f"`dreamer` {scores[4]} and `focus` {scores[5]} with weights of 200, and `focus` with weights of 1, whose model "
-        f"keeps the goal there, {scores[6]}"
+        f"`dreamer` {scores[4]} and `focus` {scores[5]} with weights of 200, and `focus` with weights of 1, "
+        f"whose model keeps the goal there, {scores[6]}"
     )
     assert said in text
     once_more = report(f"{NAME}/shelf_place/again/shelf_place").rows["focus_pcp"].seeds
