@@ -57,7 +57,7 @@ def test_there_is_a_figure_for_each_name() -> None:
         ("target_size", 6, 6),
         ("loss_scale", 1, 4),
         ("visual_goals", 1, 3),
-        ("fairness", 1, 8),
+        ("fairness", 2, 12),
         ("goal_latents", 1, 6),
         ("curves", 1, 7),
         ("exploration", 4, 4),
@@ -102,7 +102,7 @@ def test_figures_share_their_runs() -> None:
     names = {figure: {run.name for run in runs(figure)} for figure in FIGURES}
     assert names["curves"] == names["table"]
     assert len(names["visual_goals"] - names["table"]) == 4  # LEXA's two agents, and their evaluations
-    assert len(names["fairness"] & names["table"]) == 5  # the data, and PCP and LCP as they are
+    assert len(names["fairness"] & names["table"]) == 9  # the data, PCP, LCP, Dreamer and FOCUS as they are
     assert len(names["goal_latents"] & names["fairness"]) == 5  # the data, LCP as it is and with centred latents
     assert len(names["loss_scale"] & names["table"]) == 3  # the data, and Dreamer with weights of 1
     assert len(names["limits"] & names["table"]) == 9

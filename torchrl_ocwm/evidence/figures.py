@@ -74,6 +74,7 @@ _IN_UNITS = {"behaviours.reach.reward.unit": "workspace"}
 _PAPERS_LCP = {"behaviours.reach.goal.weight": 1, "behaviours.reach.reward": "latent_similarity"}
 _CENTRED = {"behaviours.reach.reward.centred": True}
 _SHOWN = {_GOALS: "frames"}
+_SMALL_IMAGES = {"image_size": 32, "mask_scale": 2}  # with masks as fine as those of 64 × 64
 _LIGHT = {"behaviours.reach.goal.weight": 1}
 _ANNEALED = {"behaviours.reach.goal.final_weight": 1, "behaviours.reach.goal.annealing_updates": 1500}
 _ENCODER = {"behaviours.reach.goal.gradient": "encoder"}
@@ -153,7 +154,7 @@ FIGURES = {
         draws=("heatmap", "curves"),
     ),
     "fairness": Figure(
-        title="What departures from the paper do for PCP and LCP",
+        title="What departures from the paper do",
         rows=(
             _PCP,
             Row(name="dreamer_pcp, position not observed", agent="dreamer_pcp", changes=_UNSEEN),
@@ -163,6 +164,11 @@ FIGURES = {
             Row(name="focus_lcp, cosine and weight 1", agent="focus_lcp", changes=_PAPERS_LCP, image_goals=True),
             Row(name="focus_lcp, centred latents", agent="focus_lcp", changes=_CENTRED, image_goals=True),
             Row(name="focus_lcp, goals that the data shows", agent="focus_lcp", changes=_SHOWN, image_goals=True),
+            *(
+                Row(name=f"{agent}, weights 1{images}", agent=agent, changes=_weights(1, 1), options=options)
+                for agent in ("dreamer", "focus")
+                for images, options in (("", {}), (", images of 32 × 32", _SMALL_IMAGES))
+            ),
         ),
         draws=("heatmap", "curves"),
     ),
