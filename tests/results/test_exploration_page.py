@@ -7,7 +7,9 @@ import re
 from typing import Any
 
 import pytest
-from reading import RESULTS, cell, missing, report, unchecked
+from reading import RESULTS, cell, missing, page, report, unchecked
+
+from torchrl_ocwm.evidence import Evidence, results
 
 NAME = "exploration"
 SHOWN = {
@@ -21,6 +23,8 @@ STATED = [
     "Reacher at commit 45c8d50 and Cube move at commit e41df8a",
     "PyTorch 2.13.0 on the CPU",
     "in 1,000 random steps",
+    "with 5,000 random steps",
+    "at commit abd9e81 on 2026-11-28 on such a machine: 35 minutes",
 ]
 ENVIRONMENTS = {"reacher": "REACHER", "cube_move": "CUBE"}
 
@@ -66,8 +70,31 @@ def learnt() -> list[str]:
     return [f"on {work.pop():,} steps {first}", *(one.replace("it scores ", "") for one in others)]
 
 
+def longer() -> list[str]:
+    """FOCUS on Cube move: the cube moves among the random steps, and never again."""
+    folder = RESULTS / NAME / "cube_move_focus"
+    curve = json.loads((folder / "results.json").read_text(encoding="utf-8"))["focus_explore"]
+    moved = {int(steps): round(int(steps) * one["moves"]) for steps, one in curve.items()}
+    total, still = max(moved), min(steps for steps, number in moved.items() if number == max(moved.values()))
+    records = json.loads((RESULTS / "figures/exploration-reacher-cpu/runs.json").read_text(encoding="utf-8"))
+    (online,) = (one["content"]["online"] for name, one in records.items() if "-focus_explore-" in name)
+    assert (online["seed_steps"], online["update_ratio"]) == ([5000], 0.1)
+    wanted = Evidence(figure="exploration", env="cube_move", seeds=1, agents=("focus_lcp on focus_explore",))
+    (one,) = results(wanted)
+    assert f"made=outputs/evidence/{one.evaluated.trained.data.name} " in page(NAME)
+    for name in ("results", "gripper"):
+        assert (folder / f"{name}.md").read_text(encoding="utf-8") in (RESULTS / NAME / "README.md").read_text(
+            encoding="utf-8"
+        )
+    return [
+        f"stopped at {total:,} of {online['steps']:,} steps",
+        f"It moves in {moved[still]} of the first {still:,} steps, most of them random, and in none of the "
+        f"{total - still:,} after that",
+    ]
+
+
 def test_page() -> None:
     rare = {"random": 1, "scripted": 1, "plan2explore": 2, "focus_explore": 2}
-    sentences = [*measured("reacher", {}), *measured("cube_move", rare), *learnt(), *STATED]
+    sentences = [*measured("reacher", {}), *measured("cube_move", rare), *learnt(), *longer(), *STATED]
     assert missing(NAME, sentences) == []
     assert unchecked(NAME, sentences) == []
