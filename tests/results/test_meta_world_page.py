@@ -23,7 +23,7 @@ STATED = [
     "The paper reports 0.43 ± 0.18 for FOCUS + LCP, 0.48 for both with PCP, 0.26 ± 0.13 for Dreamer and "
     "0.22 ± 0.12 for FOCUS",
     "on Shelf place another seed changed a score by 0.3",
-    "images have four times as many pixels, and a tenth of the updates were made",
+    "on Reacher they have four times as many pixels",
     "**One baseline is as good as FOCUS + PCP here**: FOCUS with weights of 1, the paper's",
     "**The goal does not drown here.** With weights of 1",
     "had their first updates, 2,950 at most, on a CPU",
@@ -152,6 +152,11 @@ def pick_and_place() -> list[str]:
         for one, digits in zip((found, *others.values()), (1, 0, 1, 1), strict=True)
     )
     (reacher,), (shelf,) = set(lost[0]), set(lost[2])
+    small = report("figures/fairness-reacher-cpu/reacher")
+    decoded = {row: f"{mean(small, row, 'goal_error', 100):.1f}" for row in small.rows if "weights 1" in row}
+    apart = {row: mean(small, row, "final_score") for row in decoded}
+    for row in light:
+        assert apart[f"{row}, images of 32 × 32"] <= apart[row] + 0.005
 
     def off(rows: tuple[str, ...], metric: str) -> str:
         return ", ".join(f"{mean(found, row, metric, 100):.1f}" for row in rows)
@@ -164,6 +169,9 @@ def pick_and_place() -> list[str]:
         f"Dreamer {scores[light[1]]}, FOCUS {scores[light[0]]}; random actions {scores['random']}",
         f"FOCUS + LCP is {ahead:.2f} ahead of it",
         f"FOCUS decodes it to {here[0]} cm and Dreamer to {here[1]} cm. On Reacher both are {reacher} cm off",
+        f"Dreamer decodes the goal to {decoded['dreamer, weights 1, images of 32 × 32']} in place of "
+        f"{decoded['dreamer, weights 1']} cm, FOCUS to {decoded['focus, weights 1, images of 32 × 32']} in place of "
+        f"{decoded['focus, weights 1']} cm",
         f"On Cube move FOCUS and Dreamer are {lost[1][0]} and {lost[1][1]} cm off, on Shelf place {shelf} cm both",
         f"expect to end {off(told, expected)} cm off, and end {off(told, end)} cm off",
         f"Dreamer and FOCUS with weights of 200 expect {off(heavy, expected)} cm, and end {off(heavy, end)} cm off. "
