@@ -29,6 +29,7 @@ from torchrl_ocwm.evidence import (
     in_order,
     results,
 )
+from torchrl_ocwm.evidence.options import all_options
 from torchrl_ocwm.settings import SettingsError, change, from_dict, to_dict
 
 ROOT = Path("/runs/it's a=b")
@@ -161,6 +162,26 @@ def test_with_and_without_a_target_agents_learn_from_the_same_episodes() -> None
                 assert shown.needs == (plain,)
             else:
                 assert (plain.content["policies"], plain.seed) == (shown.content["policies"], shown.seed)
+
+
+def test_small_images_are_all_that_differs() -> None:
+    """Positions come from masks of as many pixels."""
+    options = {
+        (run.agent, run.data.options.get("image_size")): all_options("reacher", run.data.options)
+        for run in runs("fairness")
+        if isinstance(run, Trained)
+        and run.changes
+        == {
+            "world_model.lambda_object_position": 1,
+            "world_model.lambda_goal_position": 1,
+        }
+    }
+    assert set(options) == {(agent, size) for agent in ("dreamer", "focus") for size in (None, 32)}
+    for agent in ("dreamer", "focus"):
+        plain, small = options[agent, None], options[agent, 32]
+        assert (plain.image_size, small.image_size) == (64, 32)
+        assert small.image_size * small.mask_scale == plain.image_size * plain.mask_scale
+        assert replace(small, image_size=64, mask_scale=1) == plain
 
 
 def test_the_episodes_without_a_target_have_the_other_options(monkeypatch: pytest.MonkeyPatch) -> None:
