@@ -35,6 +35,8 @@ PYTHON_SPACE := 10
 NEXT_VERSIONS := torchrl-nightly==2026.10.27 tensordict==0.15.3
 
 export MUJOCO_GL ?= egl
+# Threads that wait for each other spin by default, for so long that beside another process they hardly get on.
+export GOMP_SPINCOUNT ?= 10000
 
 .PHONY: demo test lint test-next test-pythons test-long docs check clean FORCE
 .DELETE_ON_ERROR:

@@ -183,7 +183,7 @@ def run_make(folder: Path, version: str) -> subprocess.CompletedProcess[str]:
         (folder / name).write_text((ROOT / name).read_text())
     interpreter = folder / "python"
     interpreter.write_text(
-        f'#!/bin/sh\ncase "$*" in *venv*) echo "makes an environment"; exit 3;; esac\necho {version}\n'
+        f'#!/bin/sh\ncase "$*" in *venv*) echo "makes an environment; $GOMP_SPINCOUNT"; exit 3;; esac\necho {version}\n'
     )
     interpreter.chmod(0o755)
     return subprocess.run(
@@ -202,6 +202,16 @@ def test_make_says_which_versions_of_python_it_takes(tmp_path: Path, version: st
 
 def test_make_goes_on_with_a_version_that_it_takes(tmp_path: Path) -> None:
     assert "makes an environment" in run_make(tmp_path, "3.10").stdout
+
+
+@pytest.mark.parametrize(("given", "reaches"), [(None, "10000"), ("7", "7")])
+def test_threads_that_make_starts_do_not_spin_for_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str | None, reaches: str
+) -> None:
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)  # of the make that runs these tests
+    if given:
+        monkeypatch.setenv("GOMP_SPINCOUNT", given)
+    assert f"environment; {reaches}\n" in run_make(tmp_path, "3.10").stdout
 
 
 def make(*arguments: str) -> str:
