@@ -121,10 +121,13 @@ def paid() -> list[str]:
     groups = ("cube moved", "cube at its start, gripper low", "cube at its start, gripper high")
     focus, own, pcp, lcp = ([f"{one[group]['cube']:.2f}" for group in groups] for one in found.values())
     assert list(found)[2:] == ["FOCUS + PCP", "FOCUS + LCP"]
+    rare = {one[groups[2]]["share"] for one in found.values()}
+    assert len(rare) == 1
     return [
         f"pays {focus[2]} where the gripper is high, {focus[1]} where it is low",
         f"and {focus[0]} where the cube has moved",
         f"would pay {pcp[0]} where the cube has moved, and {pcp[1]} or {pcp[2]} where it has not",
+        f"Frames with a high gripper are rare here, {rare.pop():.0%}",
         f"tells them apart best: {lcp[0]} against {lcp[1]} and {lcp[2]}",
         f"{own[2]} where the gripper is high, {own[1]} where it is low",
     ]
