@@ -121,6 +121,7 @@ def test_a_whole_figure(work: Callable[..., list[str]], tmp_path: Path) -> None:
     with EpisodeDataset.open(data.dataset(tmp_path)) as dataset:
         seen = dataset_coverage(dataset, dataset.task.objects, dataset.task.workspace)["finger"]
     assert records[data.name]["coverage"] == {"finger": seen._asdict()}
+    assert records[data.name]["episodes"] == episodes
     shown = ", ".join(f"`{row.name}`" for row in FIGURES["table"].rows)
     assert f"| {data.name} | {shown} | finger | {seen.moves:.1%} | {seen.visited:.0%} |" in text
     record = Record.of(found[0].evaluated, tmp_path)
@@ -211,6 +212,22 @@ def test_what_data_shows_of_the_objects(tmp_path: Path) -> None:
         for number, (name, one) in enumerate(zip(names, found, strict=True))
         if number
     ]
+
+
+def test_what_data_shows_is_said_of_rows_that_had_its_episodes(tmp_path: Path) -> None:
+    """Not of those that learnt before it was lost and collected again, of which older pages do not know."""
+    wanted = Evidence(figure="table", size="debug", seeds=1, goals=4)
+    found = results(wanted)
+    data = found[0].evaluated.trained.data
+    assert {one.evaluated.trained.data.name for one in found} == {data.name}
+    for one, episodes in zip(found, ("first", "again", *[""] * len(found)), strict=False):
+        give(tmp_path, one, 0.5)
+        trained = one.evaluated.trained
+        replace(Record.of(trained, tmp_path), episodes=episodes).write(tmp_path / trained.name)
+    seen = {"finger": {"moves": 0.5, "visited": 0.25}}
+    replace(Record.of(data, tmp_path), episodes="again", coverage=seen).write(tmp_path / data.name)
+    text = write_page(wanted, found, tmp_path).read_text(encoding="utf-8")
+    assert f"| {data.name} | `{found[1].row.name}` | finger | 50.0% | 25% |" in text
 
 
 def test_its_command_can_be_typed(tmp_path: Path) -> None:

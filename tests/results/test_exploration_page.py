@@ -102,8 +102,8 @@ def motion(folder: str) -> tuple[int, int, int, str]:
 def own_model() -> list[str]:
     """The explorer in the world model of FOCUS + LCP."""
     written = (RESULTS / NAME / "README.md").read_text(encoding="utf-8")
-    for file in ("cube_move_own/results.md", "cube_move_own/gripper.md", "entropy/entropy.md"):
-        assert (RESULTS / NAME / file).read_text(encoding="utf-8") in written
+    for file in ("results.md", "gripper.md"):
+        assert (RESULTS / NAME / "cube_move_own" / file).read_text(encoding="utf-8") in written
     steps, first, moved, visited = motion("cube_move_own")
     alone = motion("cube_move_focus")
     assert (steps, first) == alone[:2]
@@ -115,21 +115,33 @@ def own_model() -> list[str]:
     ]
 
 
+def entropies(folder: str) -> list[dict[str, str]]:
+    """Group of frames → the entropy of the cube's latent, for each world model."""
+    shown = (RESULTS / NAME / folder / "entropy.md").read_text(encoding="utf-8")
+    assert shown in (RESULTS / NAME / "README.md").read_text(encoding="utf-8")
+    found = json.loads((RESULTS / NAME / folder / "entropy.json").read_text(encoding="utf-8"))
+    return [{group: f"{one['cube']:.2f}" for group, one in groups.items()} for groups in found.values()]
+
+
 def paid() -> list[str]:
-    """What the reward pays for, model by model."""
-    found = json.loads((RESULTS / NAME / "entropy" / "entropy.json").read_text(encoding="utf-8"))
-    groups = ("cube moved", "cube at its start, gripper low", "cube at its start, gripper high")
-    focus, own, pcp, lcp = ([f"{one[group]['cube']:.2f}" for group in groups] for one in found.values())
-    assert list(found)[2:] == ["FOCUS + PCP", "FOCUS + LCP"]
-    rare = {one[groups[2]]["share"] for one in found.values()}
-    assert len(rare) == 1
+    """What the reward pays for, model by model; the explorers' in their own frames too."""
+    moved, low, high, hidden = (
+        "cube moved",
+        "cube at its start, gripper low",
+        "cube at its start, gripper high",
+        "cube hidden",
+    )
+    (alone,), (own,) = entropies("cube_move_focus"), entropies("cube_move_own")
+    focus, _, pcp, lcp = entropies("entropy")
+    assert own[hidden] == max(own.values())
     return [
-        f"pays {focus[2]} where the gripper is high, {focus[1]} where it is low",
-        f"and {focus[0]} where the cube has moved",
-        f"would pay {pcp[0]} where the cube has moved, and {pcp[1]} or {pcp[2]} where it has not",
-        f"Frames with a high gripper are rare here, {rare.pop():.0%}",
-        f"tells them apart best: {lcp[0]} against {lcp[1]} and {lcp[2]}",
-        f"{own[2]} where the gripper is high, {own[1]} where it is low",
+        f"It is higher where the gripper is high**: {alone[high]}, where it is low {alone[low]}",
+        f"pays {focus[high]} where the gripper is high, {focus[low]} where it is low, "
+        f"and {focus[moved]} where the cube has moved",
+        f"would pay {pcp[moved]} where the cube has moved, and {pcp[low]} or {pcp[high]} where it has not",
+        f"tells them apart best: {lcp[moved]} against {lcp[low]} and {lcp[high]}",
+        f"a high gripper pays less than a low one, {own[high]} against {own[low]}, "
+        f"and hiding the cube pays most, {own[hidden]}",
     ]
 
 

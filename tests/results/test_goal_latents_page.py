@@ -39,14 +39,18 @@ def test_scores(name: str) -> None:
     assert len(found.rows[name].runs) == 1
 
 
-def on_cube_move() -> str:
+def on_cube_move() -> list[str]:
     found, table = (report(f"figures/{name}-cube_move-cpu/cube_move") for name in ("goal_latents", "table"))
     names = [f"{name}{how}" for how in ("", ", image goals") for name in ("focus_lcp", "focus_lcp, centred latents")]
     scores = [mean(found, name, "final_score") for name in names]
     one, other = (float(seed["final_score"].mean()) for seed in table.rows["focus_lcp"].seeds)
     assert abs(one - other) > max(scores[1] - scores[0], scores[3] - scores[2]) > 0
     plain, centred, image, centred_image = (f"{score:.2f}" for score in scores)
-    return f"{plain} plain and {centred} centred with positions, {image} and {centred_image} with images"
+    light, light_image = (mean(found, f"focus_lcp, weight 1{how}", "final_score") for how in ("", ", image goals"))
+    return [
+        f"{plain} plain and {centred} centred with positions, {image} and {centred_image} with images",
+        f"With a weight of 1 it scores {light:.2f} and {light_image:.2f} there",
+    ]
 
 
 def test_page() -> None:
@@ -64,7 +68,7 @@ def test_page() -> None:
         f"With a weight of 100 the latents of all places are alike ({heavy[1]:.3f}), and yet the best match is "
         f"{heavy[4]:.0f} mm from the goal; with more contrast it is {nearest:.0f} mm or more",
         "Less than with a weight of 1",
-        on_cube_move(),
+        *on_cube_move(),
         f"On Cube move, with a weight of 100, the latents are still more alike ({cube_move[1]:.3f}), and "
         f"the best match is {cube_move[4]:.0f} mm from the goal ([table]",
         *STATED,

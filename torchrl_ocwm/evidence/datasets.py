@@ -14,6 +14,7 @@ from torchrl_ocwm.evidence.options import all_options, image_size
 from torchrl_ocwm.evidence.run import Run
 from torchrl_ocwm.evidence.settings import Machine
 from torchrl_ocwm.training import Online
+from torchrl_ocwm.training.provenance import digest
 
 #: Seeds an explorer's dataset, and how much it learns while it explores.
 SEED_STEPS, UPDATE_RATIO = 0.1, 0.1
@@ -42,6 +43,14 @@ class Data(Run):
     def reached(self, root: Path) -> int:
         """Steps collected."""
         return steps_in(self.dataset(root))
+
+    def episodes(self, root: Path) -> str:
+        """Their digest."""
+        try:
+            with EpisodeDataset.open(self.dataset(root)) as dataset:
+                return digest(dataset)
+        except DatasetError:
+            return ""
 
     def coverage(self, root: Path) -> dict[str, dict[str, float]]:
         """How often each object moves, and how much of the workspace it visits."""

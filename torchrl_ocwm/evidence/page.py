@@ -126,10 +126,15 @@ def _section(env: str, figure: Figure, done: Sequence[Result], root: Path, folde
 
 
 def _shown(done: Sequence[Result], records: dict[str, Record]) -> list[str]:
-    """What each dataset shows of the objects: nobody learns to move what never moves."""
+    """What each dataset shows of the objects: nobody learns to move what never moves.
+
+    Where its episodes are known, only rows that had them are named.
+    """
     rows: dict[str, dict[str, None]] = {}
     for one in done:
-        rows.setdefault(one.evaluated.trained.data.name, {})[f"`{one.row.name}`"] = None
+        trained = one.evaluated.trained
+        if records[trained.data.name].episodes in ("", records[trained.name].episodes):
+            rows.setdefault(trained.data.name, {})[f"`{one.row.name}`"] = None
     lines = [
         f"| {name} | {', '.join(learnt)} | {thing} | {seen['moves']:.1%} | {seen['visited']:.0%} |"
         for name, learnt in rows.items()

@@ -33,7 +33,7 @@ class Record:
         commands: What did it, paths as seen from the folder of all runs.
         commit: Of the code that did it last.
         machine: That did it last.
-        episodes: Of a training: what tells the episodes that it had from others, collected by the same settings.
+        episodes: Of a dataset and of a training: what tells its episodes from others, collected by the same settings.
         coverage: Of a dataset: object → how often it moves, and how much of the workspace it visits
             (:class:`~torchrl_ocwm.data.Coverage`).
     """

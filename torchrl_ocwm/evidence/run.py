@@ -58,7 +58,7 @@ class Run(ABC):
         """How much of the work is done, as far as its files say."""
 
     def episodes(self, root: Path) -> str:  # noqa: ARG002
-        """What tells the episodes that it learnt from, as far as its files say."""
+        """What tells the episodes of a dataset, or those that it learnt from, as far as its files say."""
         return ""
 
     def coverage(self, root: Path) -> dict[str, dict[str, float]]:  # noqa: ARG002

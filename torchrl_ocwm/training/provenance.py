@@ -28,6 +28,11 @@ def trained_on(file: Path) -> str:
     return "" if there is None else there["dataset"]["digest"]
 
 
+def digest(dataset: EpisodeDataset) -> str:
+    """What tells the episodes of a dataset: :func:`trained_on` of what is trained on all of them."""
+    return _fingerprint(dataset, len(dataset.episode_lengths))["digest"]
+
+
 def check_may_go_on(file: Path, training: Training, dataset: EpisodeDataset, *, grows: bool = False) -> None:
     """Raise unless a run may go on from a checkpoint with these settings and this dataset.
 
@@ -95,6 +100,6 @@ def _other_dataset(there: dict[str, Any], dataset: EpisodeDataset, grows: bool) 
 def _fingerprint(dataset: EpisodeDataset, episodes: int) -> dict[str, Any]:
     """Tells the first episodes of a dataset by their lengths and actions, wherever it is kept."""
     lengths = dataset.episode_lengths[:episodes]
-    digest = hashlib.sha256(repr(lengths).encode())
-    digest.update(dataset.records["action"][: sum(lengths)].contiguous().numpy().tobytes())
-    return {"episodes": episodes, "records": sum(lengths), "digest": digest.hexdigest()}
+    told = hashlib.sha256(repr(lengths).encode())
+    told.update(dataset.records["action"][: sum(lengths)].contiguous().numpy().tobytes())
+    return {"episodes": episodes, "records": sum(lengths), "digest": told.hexdigest()}
