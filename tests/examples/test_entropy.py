@@ -35,6 +35,7 @@ def written(folder: Path) -> TensorDict:
     records["next", "object_position_true"], records["next", "object_visible"][:] = cube, True
     cube[2, 1:, 0, 0], records["next", "object_visible"][3] = 0.03, False
     proprio[0, :, -1], proprio[1:, :, -1] = 0.05, 0.5
+    proprio[3, :25, -1], cube[3, 40:, 0, 0] = 0.05, 0.03  # hidden frames of all kinds
     records["action"][:, 0], records["next", "done"][:, -1] = 0, True
     with EpisodeDataset.create(folder, example=records[0, 0], metadata=metadata) as dataset:
         for one in records:
