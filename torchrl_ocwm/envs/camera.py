@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 import threading
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from torchrl_ocwm.envs.culling import culled_geoms
 from torchrl_ocwm.envs.opengl import OPEN, close_at_exit, import_mujoco
 from torchrl_ocwm.envs.shared_context import SharedContext, shared_context
 
@@ -18,6 +20,7 @@ else:
 
 
 _MAX_GEOMS = 1 << 16  # two bytes of their colour hold their number
+_NOT_DRAWN = 5  # a group of geoms that MuJoCo leaves out unless asked for it
 
 
 class Frame(NamedTuple):
@@ -39,7 +42,8 @@ class Camera:
     """Renders a MuJoCo model from one of its cameras, off screen.
 
     A frame takes two passes of OpenGL, one for the colours and one for segmentation and depth together. Shadows,
-    reflections and multisampling are off by default: they cost most of the time of a software renderer.
+    reflections and multisampling are off by default: they cost most of the time of a software renderer. So do meshes:
+    those that cannot be in the picture are not drawn, unless they may cast a shadow or a reflection into it.
 
     Args:
         model: The MuJoCo model. It may be stepped by any suite.
@@ -102,7 +106,7 @@ class Camera:
         self._max_geoms = max_geoms
         self._scene = mujoco.MjvScene(model, maxgeom=max_geoms + 1)  # the last one shows that there are too many
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
-        self._known_scene: tuple[int, bytes] | None = None
+        self._culls = model.nmesh > 0 and not (shadows or reflections)  # a few simple shapes are drawn at once
         self._options = mujoco.MjvOption()
         self._view = mujoco.MjvCamera()
         self._view.type, self._view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, self.camera_id
@@ -115,16 +119,20 @@ class Camera:
     def _fine_size(self) -> tuple[int, int]:
         return self.mask_scale * self.height, self.mask_scale * self.width
 
-    def render(self, data: mujoco.MjData, *, depth: bool = False) -> Frame:
+    def render(self, data: mujoco.MjData, *, depth: bool = False, wanted: Sequence[int] | None = None) -> Frame:
         """Render the state in ``data``, which must be up to date (``mj_forward``).
 
         Args:
             data: A state of the camera's model.
             depth: Read the depth too; it comes out of the segmentation pass.
+            wanted: Ids of the geoms that you look for, one or more. Segmentation and depth then hold where these are
+                seen, and other geoms may be missing elsewhere. With detailed meshes this takes much less time.
         """
         pixels = self.picture(data)
         assert self._context is not None
         context = self._context.mujoco
+        if wanted is not None:
+            self._update_scene(data, wanted)
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
         mujoco.mjr_render(self._fine, self._scene, context)
@@ -140,14 +148,22 @@ class Camera:
             fine: As large as the segmentation, ``[S * H, S * W, 3]``.
         """
         context = self._current()
-        everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self.model, data, self._options, None, self._view, everything, self._scene)
-        if self._scene.ngeom > self._max_geoms:
-            raise ValueError(f"the scene has more than {self._max_geoms} geoms; give the camera a larger max_geoms")
+        self._update_scene(data)
         size, buffer = (self._fine, self._ids) if fine else (self._rectangle, self._pixels)
         mujoco.mjr_render(size, self._scene, context)
         mujoco.mjr_readPixels(buffer, None, size, context)
         return buffer[::-1].copy()  # OpenGL's rows run upwards
+
+    def _update_scene(self, data: mujoco.MjData, wanted: Sequence[int] | None = None) -> None:
+        groups = self.model.geom_group.copy()
+        if self._culls:
+            hidden = culled_geoms(self.model, data, self.extrinsics(data), self._window, wanted=wanted)
+            self.model.geom_group[hidden] = _NOT_DRAWN
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self.model, data, self._options, None, self._view, everything, self._scene)
+        self.model.geom_group[:] = groups
+        if self._scene.ngeom > self._max_geoms:
+            raise ValueError(f"the scene has more than {self._max_geoms} geoms; give the camera a larger max_geoms")
 
     def _current(self) -> Any:
         """MuJoCo's context, ready to be used."""
@@ -162,16 +178,12 @@ class Camera:
         return self._context.mujoco
 
     def _geoms(self) -> np.ndarray:
-        # Which geoms are in the scene depends on what is transparent; reading the list is slow.
-        scene = self._scene.ngeom, self.model.geom_rgba[:, 3].tobytes()
-        if scene != self._known_scene:
-            self._known_scene = scene
-            self._geom_of_segment = np.full(self._scene.ngeom + 1, -1, np.int32)
-            for geom in self._scene.geoms[: self._scene.ngeom]:
-                if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
-                    self._geom_of_segment[geom.segid + 1] = geom.objid
+        geom_of_segment = np.full(self._scene.ngeom + 1, -1, np.int32)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                geom_of_segment[geom.segid + 1] = geom.objid
         ids = self._ids[::-1]
-        return self._geom_of_segment[ids[..., 0] + (ids[..., 1].astype(np.int32) << 8)]
+        return geom_of_segment[ids[..., 0] + (ids[..., 1].astype(np.int32) << 8)]
 
     def _metres(self) -> np.ndarray:
         extent, clip = self.model.stat.extent, self.model.vis.map
@@ -179,6 +191,12 @@ class Camera:
         # The buffer holds 1 at the near plane and 0 at the far one, linear in 1/z.
         inverse = self._depth[::-1].astype(np.float64) * (1 / near - 1 / far) + 1 / far
         return (1 / inverse).astype(np.float32)
+
+    @property
+    def _window(self) -> np.ndarray:
+        """Slopes of the rays through the first and the last corner of the image, (2, 2)."""
+        corners = np.array([[0, 0, 1], [self.width, self.height, 1]]).T
+        return (np.linalg.inv(self.intrinsics) @ corners)[:2].T
 
     @property
     def intrinsics(self) -> np.ndarray:

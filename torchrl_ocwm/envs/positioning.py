@@ -402,7 +402,8 @@ class PositioningEnv(gymnasium.Env[Observation, np.ndarray]):
         return observation
 
     def _look(self, data: mujoco.MjData, goal: np.ndarray) -> _Seen:
-        frame = self.camera.render(data, depth=self._plane is None)
+        wanted = None if self._colour_masks else [geom for ids in self._geom_ids for geom in ids]
+        frame = self.camera.render(data, depth=self._plane is None, wanted=wanted)
         fine_masks = self._segment(frame, data)
         masks = fine_masks[:, self.mask_scale // 2 :: self.mask_scale, self.mask_scale // 2 :: self.mask_scale]
         world, visible = masks_to_positions(
