@@ -1,11 +1,12 @@
-"""Environment steps per second beside the bare minimum: physics, one RGB and one segmentation render, by hand.
+"""Environment steps per second beside physics alone, and the minimum: physics, one RGB and one segmentation render.
 
     MUJOCO_GL=egl python benchmarks/env_speed.py [--env reacher] [--rounds 30] [--steps 200] [--image-size 64]
         [--workers 2]
 
-Both run in one process, in short turns, so that a noisy machine slows both. The minimum steps the same simulator and
-renders with ``mujoco.Renderer`` and the same flags: no shadows, no reflections, no multisampling. The next row adds
-TorchRL's wrapper. The last one is a collector with random actions, a process for each environment (0: no such row).
+All take random actions, as what is in the picture has to be drawn. They run in one process, in short turns, so that a
+noisy machine slows all. The minimum steps the same simulator and renders with ``mujoco.Renderer`` and the same flags:
+no shadows, no reflections, no multisampling. The next row adds TorchRL's wrapper. The last one is a collector, one
+process for each environment (0: no such row).
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from functools import partial
+from itertools import cycle
 
 import gymnasium
 import mujoco
@@ -40,12 +42,28 @@ def make_renderer(env: PositioningEnv) -> mujoco.Renderer:
     return renderer
 
 
-def minimum(env: PositioningEnv, renderer: mujoco.Renderer, action: np.ndarray) -> Callable[[], None]:
-    """Physics and two renders, and nothing else."""
+def random_actions(env: PositioningEnv) -> Iterator[np.ndarray]:
+    """The same for every row."""
+    return cycle(np.random.default_rng(0).uniform(-1, 1, (1000, *env.action_space.shape)).astype(np.float32))
+
+
+def physics(env: PositioningEnv) -> Callable[[], None]:
+    actions = random_actions(env)
 
     def step() -> None:
+        action = next(actions)
         for _ in range(env.action_repeat):
             env._step_simulator(action)
+
+    return step
+
+
+def minimum(env: PositioningEnv, renderer: mujoco.Renderer) -> Callable[[], None]:
+    """Physics and two renders, and nothing else."""
+    move = physics(env)
+
+    def step() -> None:
+        move()
         renderer.update_scene(env.data, env.camera_name)
         renderer.render()
         renderer.enable_segmentation_rendering()
@@ -86,16 +104,18 @@ def main() -> None:
 
     name, size, workers = arguments.env, arguments.image_size, arguments.workers
     with ExitStack() as stack:
-        by_hand, env = (stack.enter_context(closing(make_one(name, size))) for _ in range(2))
+        moved, by_hand, env = (stack.enter_context(closing(make_one(name, size))) for _ in range(3))
         renderer = stack.enter_context(closing(make_renderer(by_hand)))
-        action = np.full(env.action_space.shape, 0.3)
         several = f"{workers} processes"
         wrapped = stack.enter_context(closing(make_env(name, image_size=size, horizon=10**9, seed=0)))
-        tensordict = wrapped.reset().set("action", torch.tensor(action, dtype=torch.float32))
+        start, actions, same_actions = wrapped.reset(), random_actions(env), random_actions(env)
         turns: dict[str, Callable[[], object]] = {
-            "minimum": repeat(minimum(by_hand, renderer, action), arguments.steps),
-            "gymnasium environment": repeat(lambda: env.step(action), arguments.steps),
-            "TorchRL environment": repeat(lambda: wrapped.step(tensordict), arguments.steps),
+            "physics": repeat(physics(moved), arguments.steps),
+            "minimum": repeat(minimum(by_hand, renderer), arguments.steps),
+            "gymnasium environment": repeat(lambda: env.step(next(actions)), arguments.steps),
+            "TorchRL environment": repeat(
+                lambda: wrapped.step(start.set("action", torch.from_numpy(next(same_actions)))), arguments.steps
+            ),
         }
         if workers:
             collector = make_collector(name, size, workers, arguments.steps)
