@@ -131,7 +131,7 @@ class Camera:
         pixels = self.picture(data)
         assert self._context is not None
         context = self._context.mujoco
-        if wanted is not None:
+        if self._culls and wanted is not None:
             self._update_scene(data, wanted)
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
