@@ -25,7 +25,7 @@ def test_records_are_those_of_the_page(page: Path) -> None:
     listed = re.findall(
         r"^\| ((?:datasets|trainings|evaluations)/\S+) \| .* \| ([0-9a-f]{8}\+?) \| (.+) \|$", text, re.MULTILINE
     )
-    assert len(listed) > 3
+    assert len(listed) >= 3  # a dataset, a training, an evaluation
     assert [name for name, _, _ in listed] == list(records)
     for name, commit, wall in listed:
         record = records[name]
