@@ -7,16 +7,18 @@ import operator
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 import torch
 
 from torchrl_ocwm.agents import build_agent, save_agent
-from torchrl_ocwm.envs import make_task
+from torchrl_ocwm.envs import PositioningEnv, make_task
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
@@ -44,6 +46,33 @@ def cells(printed: str) -> list[list[str]]:
     """Those of a table."""
     lines = [line for line in printed.splitlines() if "|" in line]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_speed_of_an_environment(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """All rows take the same random actions; two turns of three steps each, after one to warm up."""
+    env_speed = benchmark("env_speed")
+    made, handed_out = env_speed.random_actions, []
+
+    def random_actions(env: PositioningEnv) -> Iterator[np.ndarray]:
+        taken: list[np.ndarray] = []
+        handed_out.append(taken)
+        for action in made(env):
+            taken.append(action)
+            yield action
+
+    monkeypatch.setattr(env_speed, "random_actions", random_actions)
+    options = ["--rounds", "2", "--steps", "3", "--image-size", "16", "--workers", "1"]
+    monkeypatch.setattr(sys, "argv", ["env_speed.py", *options])
+    env_speed.main()
+    title, _, *rows = capsys.readouterr().out.splitlines()
+    assert title == "reacher, 16 x 16, median of 2 turns of 3 steps"
+    numbers = {row[:24].strip(): [float(number) for number in row[24:].split()] for row in rows}
+    assert list(numbers) == ["physics", "minimum", "gymnasium environment", "TorchRL environment", "1 processes"]
+    assert numbers["minimum"][1] == 1.0
+    assert min(speed for speed, _ in numbers.values()) > 0
+    assert len(handed_out) == 4
+    assert all(np.array_equal(actions, handed_out[0]) for actions in handed_out)
+    assert np.std(handed_out[0]) > 0.3
 
 
 def test_cost_of_agents_is_a_table_with_shares_that_add_up() -> None:
