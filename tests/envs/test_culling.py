@@ -199,6 +199,23 @@ def test_geoms_that_are_culled_are_not_drawn():
     camera.close()
 
 
+def test_the_groups_are_as_they_were_after_an_interrupt(monkeypatch):
+    model, data = random_scene(2)
+    groups, during = model.geom_group.copy(), []
+
+    def interrupt(model, *_):
+        during.append(model.geom_group.copy())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(camera_module.mujoco, "mjv_updateScene", interrupt)
+    camera = Camera(model, "eye")
+    with pytest.raises(KeyboardInterrupt):
+        camera.render(data)
+    assert not np.array_equal(during[0], groups)
+    assert np.array_equal(model.geom_group, groups)
+    camera.close()
+
+
 @pytest.mark.parametrize("effect", ["shadows", "reflections"])
 def test_what_is_not_seen_may_cast_a_shadow_or_a_reflection(monkeypatch, effect):
     def refuse(*_, **__):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -155,15 +156,22 @@ class Camera:
         return buffer[::-1].copy()  # OpenGL's rows run upwards
 
     def _update_scene(self, data: mujoco.MjData, wanted: Sequence[int] | None = None) -> None:
-        groups = self.model.geom_group.copy()
-        if self._culls:
-            hidden = culled_geoms(self.model, data, self.extrinsics(data), self._window, wanted=wanted)
-            self.model.geom_group[hidden] = _NOT_DRAWN
-        everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self.model, data, self._options, None, self._view, everything, self._scene)
-        self.model.geom_group[:] = groups
+        with self._culling(data, wanted) if self._culls else nullcontext():
+            everything = mujoco.mjtCatBit.mjCAT_ALL
+            mujoco.mjv_updateScene(self.model, data, self._options, None, self._view, everything, self._scene)
         if self._scene.ngeom > self._max_geoms:
             raise ValueError(f"the scene has more than {self._max_geoms} geoms; give the camera a larger max_geoms")
+
+    @contextmanager
+    def _culling(self, data: mujoco.MjData, wanted: Sequence[int] | None) -> Iterator[None]:
+        """Meanwhile, geoms that cannot be in the picture are in a group that is not drawn."""
+        culled = culled_geoms(self.model, data, self.extrinsics(data), self._window, wanted=wanted)
+        groups = self.model.geom_group.copy()
+        try:
+            self.model.geom_group[culled] = _NOT_DRAWN
+            yield
+        finally:
+            self.model.geom_group[:] = groups
 
     def _current(self) -> Any:
         """MuJoCo's context, ready to be used."""
