@@ -103,7 +103,7 @@ def fruitless() -> list[str]:
     return [
         f"After {trained['work']:,} updates on this dataset it scores {score} with positions and {image_score} "
         f"with images, random actions {random} ([100 goals, one seed]",
-        f"it ends {end} m from the goal, and imagines {imagined}",
+        f"on average it ends {end} m from the goal, and imagines {imagined}",
     ]
 
 
